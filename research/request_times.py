@@ -9,17 +9,13 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from research.common.command import command_parser, run_command
-from sonarpost.config import PlatformConfig
-from sonarpost.delivery.store import Store
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.downlink.vessel_endpoint import DownlinkPacket
 from sonarpost.link.frames.contact_record import ContactSummary
@@ -27,7 +23,7 @@ from sonarpost.link.sender import ImageToSend
 from sonarpost.messages import Command
 from sonarpost.modem.interface import RateInfo
 from sonarpost.services.op_modem.config import OpModemConfig
-from sonarpost.services.op_modem.transmit_gate import TransmitGate
+from sonarpost.services.op_modem.transmission import TransmitGate
 from sonarpost.services.op_modem.vessel_endpoint import VesselLink
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.vehicle_endpoint import VehicleEndpoint
@@ -86,12 +82,12 @@ class RequestRun:
         log: Time and event of each packet after the request.
     """
 
-    def __init__(self, spec: RequestSpec, store: Store) -> None:
+    def __init__(self, spec: RequestSpec) -> None:
         self._spec = spec
         self._rng = np.random.default_rng(spec.seed)
         self._uuv = UuvModemConfig(port="none", expected_loss=spec.loss, stream_bytes=_STREAM_BYTES, **spec.vehicle)
         self._op = OpModemConfig(port="none", vehicles={str(_VEHICLE): "uuv-1"}, **spec.vessel)
-        self._vehicle = VehicleEndpoint(PlatformConfig(id="uuv-1"), self._uuv, store)
+        self._vehicle = VehicleEndpoint("uuv-1", self._uuv)
         self._mac = self._uuv.new_mac()
         self._vessel = VesselLink("vessel-1", self._op)
         self._gate = TransmitGate(self._op)
@@ -149,8 +145,7 @@ class RequestRun:
             shown = 1 if number == self._answer else number
             contact = ContactSummary(height_px=80, width_px=80, time_utc_s=float(shown))
             image = ImageToSend(image_of_number(number), f"c{shown}", contact, self._rng.bytes(length))
-            with self._vehicle.step():
-                self._vehicle.queue.add_image(image, now)
+            self._vehicle.queue.add_image(image, now)
 
     def _note(self, now: float, text: str) -> None:
         if self._is_asked:
@@ -200,10 +195,8 @@ class RequestRun:
 
     def _receive_down(self, frames: Sequence[bytes], now: float) -> None:
         for frame in frames:
-            with self._vehicle.step():
-                self._vehicle.receive(_VESSEL, frame, now)
-                effects = self._vehicle.take_changes()
-            if effects.counts["commands_received"]:
+            self._vehicle.receive(_VESSEL, frame, now)
+            if self._vehicle.take_effects().counts["commands_received"]:
                 self._note(now, "command received")
                 if self._spec.kind == "expand":
                     self._due.append((now + _CODING_S, self._answer, _STREAM_BYTES))
@@ -218,13 +211,11 @@ class RequestRun:
             interval_s = now - (self._up.start_s if self._previous_end_s is None else self._previous_end_s)
             self._previous_end_s = now
             frames, self._up = self._up.frames, None
-            with self._vehicle.step():
-                self._vehicle.packet_sent(frames, interval_s)
+            self._vehicle.packet_sent(frames, interval_s)
         rate = self._uuv.rate_info(self._vehicle.queue.rate)
         if self._is_receiving(now, is_up=False) or (self._mac.wait_s(rate.airtime_s, now) or 0.0) > 0:
             return
-        with self._vehicle.step():
-            packet = self._vehicle.next_packet(now)
+        packet = self._vehicle.next_packet(now)
         if packet is None:
             self._previous_end_s = None
             return
@@ -250,12 +241,7 @@ class RequestRun:
 
 def run_request(spec: RequestSpec) -> RequestRun:
     """Run one request; the same specification gives the same result."""
-    with tempfile.TemporaryDirectory() as folder:
-        store = Store(Path(folder) / "store.db")
-        try:
-            return RequestRun(spec, store).run()
-        finally:
-            store.close()
+    return RequestRun(spec).run()
 
 
 def new_parser() -> argparse.ArgumentParser:

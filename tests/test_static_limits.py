@@ -84,7 +84,7 @@ QUEUES = {
     "common/sonarpost/sonar/navigation.py": "_COURSE_PINGS",
     "common/sonarpost/sonar/readers/humminbird.py": "three pings",
     "services/console/events.py": "BUFFERED_EVENTS and MAX_BUFFERED_BYTES",
-    "services/op_modem/service.py": "MAX_UNSAVED; the source with the most loses its oldest",
+    "services/op_modem/reception.py": "MAX_UNSAVED; the source with the most loses its oldest",
     "services/uuv_modem/service.py": "MAX_EVENTS",
 }
 SENT = "the sender's own data"

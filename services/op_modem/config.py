@@ -132,7 +132,7 @@ class OpModemConfig(ModemServiceConfig):
         """Check the port, the acoustic key and that a wire format can be authenticated.
 
         Raises:
-            ConfigError: As `DownlinkService`.
+            ConfigError: As `ModemServiceConfig.check_with`, or no wire format remains that is authenticated.
         """
         if platform.acoustic_auth != "none" and "v1" not in self.wire_formats:
             expected = '"v1", or acoustic_auth = "none" in [platform]: the paper format has no authentication'

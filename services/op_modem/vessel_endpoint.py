@@ -127,6 +127,27 @@ class VesselLink:
         authenticated = self.authenticator is not None and update.first_frame_s >= self._authenticated_since_s
         return received_image(update, self._vessel_id, self._config.name_of(update.source), authenticated=authenticated)
 
+    def gauges(self) -> dict[str, float]:
+        """Return the state of commands, images and authentication."""
+        endpoint = self.endpoint
+        gauges = {
+            "commands_open": float(len(self.commands.open_commands)),
+            "images_incomplete": float(endpoint.incomplete_images),
+            "images_waiting": float(endpoint.next_deadline() is not None),
+            "images_held": float(self.limiter.held),
+        }
+        if self.authenticator is not None:
+            counts = self.authenticator.counts
+            gauges |= {"frames_forged": float(counts.forged), "frames_replayed": float(counts.replayed)}
+            gauges |= {
+                "frames_genuine": float(counts.genuine),
+                "key_frames_left": float(self.authenticator.frames_left),
+            }
+        if self._merger is not None:
+            merged = endpoint.v1.counts
+            gauges |= {"frames_duplicate": float(merged.duplicates), "frames_late": float(merged.late)}
+        return gauges
+
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`."""
         parts = {**prefixed(_LINK, self.endpoint.parts()), **prefixed(_LIMITS, self.limiter.parts())}

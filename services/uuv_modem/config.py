@@ -120,7 +120,7 @@ class UuvModemConfig(ModemServiceConfig):
         """Check the port, the acoustic key and that the wire format can be authenticated.
 
         Raises:
-            ConfigError: As `UuvModemService`.
+            ConfigError: As `ModemServiceConfig.check_with`, or `link` is "paper" and frames are to be authenticated.
         """
         if self.link == "paper" and platform.acoustic_auth != "none":
             expected = '"v1", or acoustic_auth = "none" in [platform]: the paper format has no authentication'

@@ -7,7 +7,6 @@ import queue
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from typing import Final
 
 import zenoh
@@ -18,6 +17,8 @@ from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import BadInputError, DeliveryError, RetryLaterError
 from sonarpost.limits import limit
+from sonarpost.link.auth.key import Direction
+from sonarpost.link.sender import OutgoingPacket
 from sonarpost.logs import kv
 from sonarpost.messages import EncodedImage, OutgoingMessage, Record, VehicleStatus
 from sonarpost.modem.interface import (
@@ -30,8 +31,9 @@ from sonarpost.modem.interface import (
     ShortMessageReceived,
 )
 from sonarpost.runtime.health import disk_gauges
-from sonarpost.runtime.modem_service import ModemService, sent_frames
-from sonarpost.runtime.service import UnitOfWork
+from sonarpost.runtime.modem_service import ServiceModem, sent_frames
+from sonarpost.runtime.saved_endpoint import SavedEndpoint, reserve_counters, stored_authenticator
+from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.security.acoustic_key import key_warning
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.status_beacon import StatusBeacon
@@ -53,15 +55,18 @@ _STATE_INTERVAL_S: Final = 0.2
 """Minimum time between two publications of the queue state when images were accepted or sent."""
 
 
-class UuvModemService(ModemService[UuvModemConfig]):
+class UuvModemService(Service[UuvModemConfig]):
     """The vehicle's end of the acoustic link.
 
     `handle` adds a record to the transmit queue. The transaction that removes the record from the inbox also writes the
-    queue. The link's thread sends the packets, and commits each before it is sent: a restart sends at most one packet
-    twice.
+    queue. The link's thread sends the packets. It commits each before it is sent, together with the end of the one
+    before: a restart sends at most one packet twice.
+
+    Attributes:
+        modem: The modem.
 
     Raises:
-        ConfigError: As `ModemService`, or `link` is "paper" and frames are to be authenticated.
+        ConfigError: See `UuvModemConfig.check_with`.
     """
 
     NAME = "uuv_modem"
@@ -69,21 +74,20 @@ class UuvModemService(ModemService[UuvModemConfig]):
     PAGE_BYTES = 512
 
     def __init__(self, platform: PlatformConfig, config: UuvModemConfig) -> None:
-        config.check_with(platform)
+        # Before the store is opened, so that a configuration error leaves no open store.
+        config = config.for_platform(platform)
         super().__init__(platform, config)
-        try:
-            rejection_log = self.interval_log(log, logging.WARNING, "Frame rejected")
-            self._endpoint = VehicleEndpoint(platform, self.config, self.store, self.key, rejection_log)
-        except BaseException:
-            self.store.close()
-            raise
+        self.modem = ServiceModem(self, self.on_modem_event)
+        self._rejected_frames = self.interval_log(log, logging.WARNING, "Frame rejected")
+        self._link = SavedEndpoint(self.store, "link/", self._new_endpoint)
         self._mac = self.config.new_mac()
+        self._is_polled = self.config.mac == "polled" and self.config.link == "v1"
         self._failed_packets = self.interval_log(log, logging.WARNING, "Packet not sent; retrying")
         self._transmissions = TransmissionTimes()
         self._beacon = StatusBeacon(platform.id, self.config.status_period_s)
         self._malformed_statuses = self.interval_log(log, logging.WARNING, "Ignoring malformed vehicle status")
         self._events: queue.SimpleQueue[ModemEvent | None] = queue.SimpleQueue()
-        self._unsaved: list[Callable[[], None]] = []  # changes of the endpoint that are not committed yet
+        self._unsaved: list[Callable[[VehicleEndpoint], None]] = []  # changes that are not committed yet
         self._packet_id: int | None = None  # the packet that the modem is sending
         self._offered: tuple[bytes, ...] = ()  # frames for the next poll
         self._retry_at_s = 0.0
@@ -94,6 +98,19 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self._published_at_s: float | None = None
         self._published_images = (0, 0)
 
+    def _new_endpoint(self) -> VehicleEndpoint:
+        authenticator = None
+        if self.modem.key is not None:
+            address = self.config.address
+            authenticator = stored_authenticator(self.store, self.modem.key, address, Direction.FROM_VEHICLE)
+        return VehicleEndpoint(
+            self.platform.id,
+            self.config,
+            authenticator,
+            first_block=self.store.origin[0],
+            rejection_log=self._rejected_frames,
+        )
+
     @override
     def on_start(self) -> None:
         """Open the port and start the link's thread."""
@@ -101,10 +118,15 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self.session.declare_queryable(keys.acoustic_transmissions(self.platform.id), self._reply_transmissions)
         if self.config.status_period_s:
             self.session.declare_subscriber(keys.vehicle_status(self.platform.id), self._on_status)
-        super().on_start()
-        if self.config.mac == "polled" and self.config.link == "v1":
+        self.modem.start()
+        if self._is_polled:
             self.modem.set_poll_handler(self._answer_poll)
         self.start_thread(self._run_link, "link")
+
+    @override
+    def on_stop(self) -> None:
+        """Close the port."""
+        self.modem.stop()
 
     # Records of the vehicle's programs
 
@@ -120,20 +142,20 @@ class UuvModemService(ModemService[UuvModemConfig]):
     def validate(self, key: str, record: Record) -> None:
         """Refuse a record that the wire format cannot carry."""
         assert isinstance(record, (EncodedImage, OutgoingMessage))
-        self._endpoint.check(record)
+        self._link.current.check(record)
 
     @override
     def check_capacity(self, key: str) -> None:
         """Leave records with their senders below the disk reserve, and messages while `max_messages` wait."""
         super().check_capacity(key)
-        if key == keys.message_outgoing(self.platform.id) and not self._endpoint.queue.accepts_messages:
+        if key == keys.message_outgoing(self.platform.id) and not self._link.current.queue.accepts_messages:
             raise RetryLaterError(f"{key}: {self.config.max_messages} messages wait")
 
     @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Add a record to the transmit queue."""
         assert isinstance(record, (EncodedImage, OutgoingMessage))
-        self._endpoint.add(record, time.time())
+        self._link.current.add(record, time.time())
 
     def _on_status(self, sample: zenoh.Sample) -> None:
         """Keep the latest status of the vehicle; called in a thread of Zenoh."""
@@ -146,41 +168,23 @@ class UuvModemService(ModemService[UuvModemConfig]):
             self.count("statuses_ignored")
             self._malformed_statuses.log(reason=str(error))
 
-    def _queue_status(self, now: float) -> None:
-        """Add the vehicle's status to the transmit queue if it is due.
-
-        Raises:
-            DeliveryError: The store cannot be written.
-        """
-        if not self._beacon.is_due(now):
-            return
-        with self._endpoint.step():
-            disk_free_bytes = disk_gauges(self.platform.state_dir).get("disk_free_bytes")
-            status = self._beacon.message(
-                now, self._endpoint.queue.images_waiting, None if disk_free_bytes is None else int(disk_free_bytes)
-            )
-            self._endpoint.add_status(status, now, self.config.status_period_s)
-            self.commit(UnitOfWork())
-        self._beacon.queued(now)
-        self.count("statuses_queued")
-
     @override
     @contextmanager
     def handling(self, *, wait: bool = True) -> Iterator[bool]:
         """Enclose the handling in a step of the endpoint, and wake the link's thread."""
-        with self._endpoint.step(), super().handling(wait=wait) as is_held:
+        with self._link.step(), super().handling(wait=wait) as is_held:
             yield is_held
         self._events.put(None)
 
     @override
     def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
         """Commit effects together with the changes of the endpoint."""
-        with self._endpoint.step():
-            return super().commit_batch([*handled, (self._endpoint.take_changes(), None)])
+        with self._link.step() as endpoint:
+            changes = (endpoint.take_effects(), self._link.changes())
+            return super().commit_batch([*handled, *((effects, None) for effects in changes)])
 
     # Events of the modem
 
-    @override
     def on_modem_event(self, event: ModemEvent) -> None:
         """Publish the start or end of a transmission, and pass the event to the link's thread."""
         now_utc_s = time.time()
@@ -214,7 +218,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             return
 
     def _process(self, event: ModemEvent | None) -> None:
-        """Process an event, except for its changes of the endpoint, which `_save` makes and commits."""
+        """Process an event, except for its changes of the endpoint, which `_advance` makes and commits."""
         now = time.time()
         match event:
             case PacketSent():
@@ -223,14 +227,14 @@ class UuvModemService(ModemService[UuvModemConfig]):
                 self._packet_failed(event, now)
             case FrameDecoded():
                 self._mac.channel_busy(now)
-            case FrameReceived(dest=self.config.address):
-                self._receive(partial(self._endpoint.receive, event.src, event.data, now))
-            case ShortMessageReceived(dest=self.config.address):
-                self._receive(partial(self._endpoint.receive_mini, event.src, event.bits, now))
+            case FrameReceived(dest=self.config.address, src=source, data=data):
+                self._receive(lambda endpoint: endpoint.receive(source, data, now))
+            case ShortMessageReceived(dest=self.config.address, src=source, bits=bits):
+                self._receive(lambda endpoint: endpoint.receive_mini(source, bits, now))
             case _:
                 pass
 
-    def _receive(self, change: Callable[[], None]) -> None:
+    def _receive(self, change: Callable[[VehicleEndpoint], None]) -> None:
         if len(self._unsaved) < MAX_UNSAVED:
             self._unsaved.append(change)
         else:
@@ -246,7 +250,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
         self._mac.sent(now - packet_s, now)
         interval_s = packet_s if self._previous_end_s is None else now - self._previous_end_s
         self._previous_end_s = now
-        self._unsaved.append(partial(self._endpoint.packet_sent, sent.frames, interval_s))
+        self._unsaved.append(lambda endpoint: endpoint.packet_sent(sent.frames, interval_s))
         self._publish_packet(sent, now)
 
     def _packet_failed(self, failed: PacketFailed, now: float) -> None:
@@ -266,9 +270,7 @@ class UuvModemService(ModemService[UuvModemConfig]):
             error = ""
             try:
                 now = time.time()
-                self._save()
-                self._queue_status(now)
-                wait_s = self._send(now)
+                wait_s = self._advance(now)
                 self._publish_queue_state(now)
             except (DeliveryError, BadInputError) as failure:
                 # Nothing is sent until the changes are committed.
@@ -278,65 +280,97 @@ class UuvModemService(ModemService[UuvModemConfig]):
                 self.stopping.wait(SAVE_AGAIN_S)
             self._link_error = error
 
-    def _save(self) -> None:
-        """Change the endpoint by the events, and commit. An event that cannot be processed is left out.
+    def _advance(self, now: float) -> float:
+        """Change the endpoint by the events, choose the next packet, commit both together, and send the packet.
+
+        An event that cannot be processed is left out.
+
+        Args:
+            now: UTC in seconds.
+
+        Returns:
+            Time until the next packet, in seconds.
 
         Raises:
             DeliveryError: The store cannot be written; the next call repeats the changes.
+            FrameError: Authentication has no counters left.
         """
-        size = len(self._unsaved)
-        while True:
-            changes = self._unsaved[:size]
+        try:
+            return self._step(self._unsaved, now)
+        except DeliveryError:
+            raise
+        except Exception:
+            # The step has no effect: its events are processed one by one, without a packet.
+            if not self._process_each_alone():
+                raise
+        return 0.0
+
+    def _process_each_alone(self) -> int:
+        """Change the endpoint by the events, one by one, and commit; return the number of those that are left out."""
+        failed = 0
+        while self._unsaved:
             try:
-                with self._endpoint.step():
-                    for change in changes:
-                        change()
-                    if self._endpoint.changed:
-                        self.commit(UnitOfWork())
+                with self._link.step() as endpoint:
+                    self._unsaved[0](endpoint)
+                    self.commit(UnitOfWork())
             except DeliveryError:
                 raise
             except Exception:
-                # The step has no effect: its events are processed one by one.
-                if size > 1:
-                    size = 1
-                    continue
                 log.exception("Event of the modem left out")
                 self.count("frames_failed")
-            del self._unsaved[:size]
-            if not self._unsaved:
-                return
+                failed += 1
+            del self._unsaved[0]
+        return failed
 
-    def _send(self, now: float) -> float:
-        """Send a packet if one is due; return the time until then, in seconds.
+    def _step(self, changes: Sequence[Callable[[VehicleEndpoint], None]], now: float) -> float:
+        with self._link.step() as endpoint:
+            for change in changes:
+                change(endpoint)
+            has_status = self._beacon.is_due(now)
+            if has_status:
+                self._queue_status(endpoint, now)
+            wait_s = self._wait_s(endpoint, now)
+            packet = None
+            if wait_s is None:
+                reserve_counters(self.store, endpoint.authenticator)
+                packet = endpoint.next_packet(now)
+                self._previous_end_s = None if packet is None else self._previous_end_s
+            if endpoint.changed:
+                self.commit(UnitOfWork())
+            self._unsaved.clear()
+            if has_status:
+                self._beacon.queued(now)
+                self.count("statuses_queued")
+            if packet is not None:
+                self._transmit(packet)
+        return _MAX_WAIT_S if wait_s is None else wait_s
 
-        Raises:
-            DeliveryError: The store cannot be written.
-            FrameError: Authentication has no counters left.
-        """
+    def _queue_status(self, endpoint: VehicleEndpoint, now: float) -> None:
+        disk_free_bytes = disk_gauges(self.platform.state_dir).get("disk_free_bytes")
+        free_bytes = None if disk_free_bytes is None else int(disk_free_bytes)
+        status = self._beacon.message(now, endpoint.queue.images_waiting, free_bytes)
+        endpoint.add_status(status, now, self.config.status_period_s)
+
+    def _wait_s(self, endpoint: VehicleEndpoint, now: float) -> float | None:
+        """Return the time until a packet can be sent; None if it can be sent, or offered for a poll, now."""
         if self._packet_id is not None:
             return _MAX_WAIT_S
-        with self._endpoint.step():
-            packet = self._endpoint.queue.in_flight
-            rate = packet.rate if packet else self._endpoint.queue.rate
-            mac_wait_s = self._mac.wait_s(self._packet_s.get(rate, self.config.rate_info(rate).airtime_s), now)
-            polled = mac_wait_s is None
-            retry_wait_s = self._retry_at_s - now
-            if retry_wait_s > self.config.retry_s:
-                retry_wait_s = 0.0  # the clock was set back
-            wait_s = max(mac_wait_s or 0.0, retry_wait_s)
-            if wait_s > 0 or not (polled or self.modem.ready):
-                return wait_s or _MAX_WAIT_S
-            packet = self._endpoint.next_packet(now)
-            if packet is None:
-                self._previous_end_s = None
-                return _MAX_WAIT_S
-            if self._endpoint.changed:
-                self.commit(UnitOfWork())
-            if polled:
-                self._offered = packet.frames
-            else:
-                self._packet_id = self.modem.send_packet(self.config.destination, packet.rate, packet.frames)
-            return _MAX_WAIT_S
+        packet = endpoint.queue.in_flight
+        rate = packet.rate if packet else endpoint.queue.rate
+        mac_wait_s = self._mac.wait_s(self._packet_s.get(rate, self.config.rate_info(rate).airtime_s), now)
+        retry_wait_s = self._retry_at_s - now
+        if retry_wait_s > self.config.retry_s:
+            retry_wait_s = 0.0  # the clock was set back
+        wait_s = max(mac_wait_s or 0.0, retry_wait_s)
+        if wait_s > 0:
+            return wait_s
+        return None if mac_wait_s is None or self.modem.ready else _MAX_WAIT_S
+
+    def _transmit(self, packet: OutgoingPacket) -> None:
+        if self._is_polled:
+            self._offered = packet.frames
+        else:
+            self._packet_id = self.modem.send_packet(self.config.destination, packet.rate, packet.frames)
 
     # Publications and health
 
@@ -353,27 +387,31 @@ class UuvModemService(ModemService[UuvModemConfig]):
         Raises:
             DeliveryError: The state cannot be reloaded after a failed commit.
         """
-        images = (self._endpoint.images_accepted, self._endpoint.queue.images_waiting)
+        images = (self._link.current.images_accepted, self._link.current.queue.images_waiting)
         interval_s = self.config.queue_interval_s
         if images != self._published_images:
             interval_s = min(interval_s, _STATE_INTERVAL_S)
         if self._published_at_s is None or not 0 <= now - self._published_at_s < interval_s:
             self._published_at_s, self._published_images = now, images
-            self.publish(keys.acoustic_queue(self.platform.id), self._endpoint.queue_state(now))
+            with self._link.step() as endpoint:
+                record = endpoint.queue_state(now)
+            self.publish(keys.acoustic_queue(self.platform.id), record)
 
     @override
     def gauges(self) -> Mapping[str, float]:
         """Return the state of the modem, of the transmit queue and of the key."""
-        authenticator = self._endpoint.authenticator
+        endpoint = self._link.current
+        authenticator = endpoint.authenticator
         key = {} if authenticator is None else {"key_frames_left": float(authenticator.frames_left)}
-        return {**super().gauges(), **self._endpoint.queue.gauges(), **key}
+        return {**self.modem.gauges(), **endpoint.queue.gauges(), **key}
 
     @override
     def warning(self) -> str:
         """Return what concerns the key of the link, and what the modem reports wrongly."""
-        return "; ".join(text for text in (super().warning(), key_warning(self._endpoint.authenticator)) if text)
+        texts = (self.modem.warning(), key_warning(self._link.current.authenticator))
+        return "; ".join(text for text in texts if text)
 
     @override
     def degraded_reason(self) -> str:
         """Return why the port, the modem or the link does not work."""
-        return super().degraded_reason() or self._link_error
+        return self.modem.degraded_reason() or self._link_error

@@ -1,23 +1,17 @@
-"""The vehicle's end of the acoustic link: transmit queue, receiver, commands and authentication, saved together."""
+"""The vehicle's end of the acoustic link: transmit queue, receiver, commands and authentication. It does no I/O."""
 
 from __future__ import annotations
 
 import logging
-import threading
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Final
 
 import msgpack
 
 from sonarpost.codec.interface import StreamHeader
-from sonarpost.config import PlatformConfig
-from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.errors import BadInputError, FrameError
 from sonarpost.link.auth.authentication import FrameAuthenticator
-from sonarpost.link.auth.key import AcousticKey, Direction
 from sonarpost.link.downlink.messages import (
     CommandOutcome,
     ConfirmationMessage,
@@ -40,7 +34,7 @@ from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.queue.transmit_queue import TransmitQueue
 from sonarpost.link.receiver import FeedbackReceived, FrameRejected, MessageReceived
 from sonarpost.link.sender import ImageSender, ImageToSend, OutgoingPacket
-from sonarpost.link.state import SavedParts, below, prefixed, unpack_plain
+from sonarpost.link.state import Parts, below, prefixed, unpack_plain
 from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import EncodedImage, OutgoingMessage, QueuedImage, QueueState
 from sonarpost.services.uuv_modem.config import UuvModemConfig
@@ -54,18 +48,13 @@ _COMMAND_PRIORITY: Final = 1
 _STATUS_PRIORITY: Final = 5
 _MAX_IMAGES_PUBLISHED: Final = 500
 
-# Names of the saved parts, below the name of the wire format.
+# Names of the saved parts.
+_V1, _PAPER, _IMAGES_ACCEPTED = "v1/", "paper/", "images_accepted"
 _QUEUE, _RECEIVER, _COMMANDS, _AUTHENTICATION = "queue/", "receiver/", "commands", "authentication/"
-_COUNTER_LIMIT: Final = "counter-limit/"
-_IMAGES_ACCEPTED: Final = "images_accepted"
-_PAPER: Final = "paper/"
 
 
 class VehicleEndpoint:
-    """State of the acoustic link on the vehicle, for both wire formats. It starts no thread and uses no modem.
-
-    Several threads change it, each within `step`. A step ends with the commit of `take_changes`. If a step fails, the
-    next one first reloads the state that was committed last.
+    """State of the acoustic link on the vehicle, for both wire formats. Not thread-safe.
 
     Attributes:
         queue: The transmit queue.
@@ -74,129 +63,100 @@ class VehicleEndpoint:
         changed: Whether there are changes to commit.
 
     Args:
-        platform: The vehicle.
+        platform_id: The vehicle.
         config: Configuration of the service.
-        store: Holds the state.
-        key: Authenticates frames; None for none. The `paper` format has no authentication.
+        authenticator: Authenticates frames; None for none. The `paper` format has no authentication.
+        first_block: See `V1Sender`.
         rejection_log: Logs rejected frames.
     """
 
     def __init__(
         self,
-        platform: PlatformConfig,
+        platform_id: str,
         config: UuvModemConfig,
-        store: Store,
-        key: AcousticKey | None = None,
+        authenticator: FrameAuthenticator | None = None,
+        *,
+        first_block: int = 0,
         rejection_log: IntervalLog | None = None,
     ) -> None:
-        self._platform_id = platform.id
+        self._platform_id = platform_id
         self._config = config
-        self._store = store
         self._is_v1 = config.link == "v1"
-        self._prefix = f"{config.link}/"
-        self._key = key
         self._rejection_log = rejection_log or IntervalLog(log, logging.WARNING, "Frame rejected")
-        self._lock = threading.RLock()
-        self._stale = True
-        self._reset()
-
-    def _reset(self) -> None:
+        self.authenticator = authenticator
+        self.queue: ImageSender = PaperSender(config.rate_info(config.rate))
+        if self._is_v1:
+            self.queue = TransmitQueue(config.queue_config(), first_block=first_block, protection=authenticator)
+        self.images_accepted = 0
         self.changed = False
-        self.authenticator: FrameAuthenticator | None = None
-        if self._key is not None:
-            # The limit belongs to the key: another key starts at 0, and the old one continues when it is used again.
-            self._limit_name = _COUNTER_LIMIT + self._key.fingerprint
-            limit = int(self._store.get_state(self._limit_name) or b"0")
-            address = self._config.address
-            self.authenticator = FrameAuthenticator(self._key, address, Direction.FROM_VEHICLE, first_counter=limit)
-        self.queue = self._new_queue()
-        self.images_accepted = self._store.read_state(_IMAGES_ACCEPTED, int, 0)
-        self._receiver = V1Receiver(protection=self.authenticator)
-        self._commands = ReceivedCommands(self._platform_id, self._config)
+        self._receiver = V1Receiver(protection=authenticator)
+        self._commands = ReceivedCommands(platform_id, config)
         self._outcomes: list[tuple[int, CommandOutcome]] = []
         self._effects = UnitOfWork()
-        self._saved = SavedParts({})
-
-    def _new_queue(self) -> ImageSender:
-        if not self._is_v1:
-            return PaperSender(self._config.rate_info(self._config.rate))
-        config, first_block = self._config.queue_config(), self._store.origin[0]
-        return TransmitQueue(config, first_block=first_block, protection=self.authenticator)
+        self._v1_parts: dict[str, bytes] = {}  # saved parts of `v1` while the format is `paper`
 
     # Saved state
 
-    @contextmanager
-    def step(self) -> Iterator[None]:
-        """Context manager for changes: locks the endpoint, and reloads the state if the last step failed."""
-        with self._lock:
-            if self._stale:
-                self._load()
-                self._stale = False
-            try:
-                yield
-            except BaseException:
-                self._stale = True
-                raise
-
-    def _load(self) -> None:
-        self._reset()
-        saved = self._store.states(self._prefix)
-        self._saved = SavedParts(saved)
-        errors: dict[str, BadInputError] = {}
-        errors |= prefixed(_QUEUE, self.queue.restore(below(_QUEUE, saved)))
-        errors |= prefixed(_RECEIVER, self._receiver.restore(below(_RECEIVER, saved)))
+    def parts(self) -> dict[str, bytes]:
+        """Return the state to save, see `sonarpost.link.state`: each part below the name of its wire format."""
+        parts = {_IMAGES_ACCEPTED: str(self.images_accepted).encode()}
+        if not self._is_v1:
+            return {**parts, **self._v1_parts, **prefixed(_PAPER + _QUEUE, self.queue.parts())}
+        parts |= prefixed(_V1 + _QUEUE, self.queue.parts()) | prefixed(_V1 + _RECEIVER, self._receiver.parts())
+        parts[_V1 + _COMMANDS] = bytes(msgpack.packb(self._commands.export()))
         if self.authenticator is not None:
-            errors |= prefixed(_AUTHENTICATION, self.authenticator.restore(below(_AUTHENTICATION, saved)))
-        if _COMMANDS in saved:
-            try:
-                self._commands.restore(unpack_plain(dict, saved[_COMMANDS], "uuv_modem state"))
-            except BadInputError as error:
-                errors[_COMMANDS] = error
-        for name, reason in errors.items():
-            self._discard(self._prefix + name, saved.get(name, b""), reason)
-        if errors:
-            self._effects.count("states_discarded")
-        if self._is_v1:
-            self._add_images_of_paper_queue()
+            parts |= prefixed(_V1 + _AUTHENTICATION, self.authenticator.parts())
+        return parts
+
+    def restore(self, parts: Parts) -> dict[str, BadInputError]:
+        """Replace the state of a new endpoint by saved parts; return why parts were skipped.
+
+        After a change from the `paper` format to `v1`, the images that still waited are moved. After a change from `v1`
+        to `paper`, its state is kept.
+        """
         self.changed = True
+        errors: dict[str, BadInputError] = {}
+        try:
+            self.images_accepted = int(parts.get(_IMAGES_ACCEPTED, b"0"))
+        except ValueError:
+            errors[_IMAGES_ACCEPTED] = FrameError("uuv_modem state", "", parts[_IMAGES_ACCEPTED], "a number")
+        if not self._is_v1:
+            self._v1_parts = {name: data for name, data in parts.items() if name.startswith(_V1)}
+            return errors | prefixed(_PAPER + _QUEUE, self.queue.restore(below(_PAPER + _QUEUE, parts)))
+        errors |= prefixed(_V1 + _QUEUE, self.queue.restore(below(_V1 + _QUEUE, parts)))
+        errors |= prefixed(_V1 + _RECEIVER, self._receiver.restore(below(_V1 + _RECEIVER, parts)))
+        if self.authenticator is not None:
+            skipped = self.authenticator.restore(below(_V1 + _AUTHENTICATION, parts))
+            errors |= prefixed(_V1 + _AUTHENTICATION, skipped)
+        if _V1 + _COMMANDS in parts:
+            try:
+                self._commands.restore(unpack_plain(dict, parts[_V1 + _COMMANDS], "uuv_modem state"))
+            except BadInputError as error:
+                errors[_V1 + _COMMANDS] = error
+        return errors | self._take_images_of_paper_queue(below(_PAPER + _QUEUE, parts))
 
-    def _discard(self, name: str, data: bytes, reason: BadInputError) -> None:
-        log.error("Discarding an unreadable part of the link state", extra=kv(part=name, reason=str(reason)))
-        self._effects.quarantine(f"state {name}", data, str(reason))
-
-    def _add_images_of_paper_queue(self) -> None:
-        """Move images that still waited when the configuration changed from the `paper` format to `v1`."""
-        parts = self._store.states(_PAPER)
+    def _take_images_of_paper_queue(self, parts: Parts) -> dict[str, BadInputError]:
         paper_queue = PaperSender(self._config.rate_info(self._config.rate))
-        for name, reason in paper_queue.restore(below(_QUEUE, parts)).items():
-            self._discard(_PAPER + _QUEUE + name, parts[_QUEUE + name], reason)
+        errors: dict[str, BadInputError] = dict(prefixed(_PAPER + _QUEUE, paper_queue.restore(parts)))
         for waiting in paper_queue.images:
             image = ImageToSend(waiting.image_id, waiting.contact_id, waiting.contact, waiting.stream)
             try:
                 self._check_image(image)
                 self.queue.add_image(image, 0.0)
             except BadInputError as error:
-                self._discard(f"{_PAPER}{_QUEUE}image/{waiting.order}", image.stream, error)
-        for name in parts:
-            self._effects.delete_state(_PAPER + name)
+                errors[f"{_PAPER}{_QUEUE}image/{waiting.order}"] = error
+        return errors
 
-    def take_changes(self) -> UnitOfWork:
-        """Return what to commit in this step: the changed parts of the state, and new records for consumers."""
-        parts = {**prefixed(_QUEUE, self.queue.parts()), **prefixed(_RECEIVER, self._receiver.parts())}
-        parts[_COMMANDS] = bytes(msgpack.packb(self._commands.export()))
-        if self.authenticator is not None:
-            parts |= prefixed(_AUTHENTICATION, self.authenticator.parts())
+    def take_effects(self) -> UnitOfWork:
+        """Return the counts and the new records for consumers, to commit together with the changed parts."""
         effects, self._effects = self._effects, UnitOfWork()
-        effects.put_states(self._prefix, self._saved.changes(parts))
-        self._saved.commit(parts)
-        effects.put_state(_IMAGES_ACCEPTED, str(self.images_accepted).encode())
         self.changed = False
         return effects
 
     # Records of the vehicle's programs
 
     def check(self, record: EncodedImage | OutgoingMessage) -> None:
-        """Check that the wire format can carry a record. Needs no step and does not wait.
+        """Check that the wire format can carry a record. Another thread may call this at any time.
 
         Raises:
             BadInputError: Names the invalid field.
@@ -371,21 +331,12 @@ class VehicleEndpoint:
         """Return the packet to send, None if there is nothing to send. Commit the changes before it is sent.
 
         Raises:
-            DeliveryError: No counters can be reserved for authentication.
-            FrameError: All counters of the key are used.
+            FrameError: No counters are reserved for authentication, or all counters of the key are used.
         """
-        self._reserve_counters()
         before = self.queue.in_flight
         packet = self.queue.next_packet(now)
         self.changed |= packet is not before
         return packet
-
-    def _reserve_counters(self) -> None:
-        if self.authenticator is None or (limit := self.authenticator.requested_limit) is None:
-            return
-        with self._store.transaction() as tx:
-            tx.put_state(self._limit_name, str(limit).encode())
-        self.authenticator.grant(limit)
 
     def packet_sent(self, frames: tuple[bytes, ...], interval_s: float) -> None:
         """Record that frames of the packet in flight were sent; see `ImageSender.sent`."""
@@ -396,35 +347,30 @@ class VehicleEndpoint:
         self.changed = True
 
     def queue_state(self, now: float) -> QueueState:
-        """Return the committed state of the transmit queue.
-
-        Raises:
-            DeliveryError: The state cannot be reloaded.
-        """
-        with self.step():
-            queue, expected = self.queue, self.queue.expected(now)
-            images = tuple(
-                QueuedImage(
-                    image_id=image.image_id,
-                    contact_id=image.contact_id,
-                    bytes_left=image.bytes_left,
-                    preview_utc_s=image.preview_s,
-                    expected_utc_s=image.done_s,
-                )
-                for image in expected[:_MAX_IMAGES_PUBLISHED]
+        """Return the record of the transmit queue."""
+        queue, expected = self.queue, self.queue.expected(now)
+        images = tuple(
+            QueuedImage(
+                image_id=image.image_id,
+                contact_id=image.contact_id,
+                bytes_left=image.bytes_left,
+                preview_utc_s=image.preview_s,
+                expected_utc_s=image.done_s,
             )
-            return QueueState(
-                platform_id=self._platform_id,
-                time_utc_s=now,
-                rate=queue.rate,
-                frame_loss=queue.measured_loss,
-                packet_interval_s=min(queue.packet_interval_s, 86400.0),
-                messages_waiting=queue.messages_waiting,
-                message_bytes=queue.message_bytes,
-                images_waiting=len(expected),
-                images=images,
-                images_accepted=self.images_accepted,
-            )
+            for image in expected[:_MAX_IMAGES_PUBLISHED]
+        )
+        return QueueState(
+            platform_id=self._platform_id,
+            time_utc_s=now,
+            rate=queue.rate,
+            frame_loss=queue.measured_loss,
+            packet_interval_s=min(queue.packet_interval_s, 86400.0),
+            messages_waiting=queue.messages_waiting,
+            message_bytes=queue.message_bytes,
+            images_waiting=len(expected),
+            images=images,
+            images_accepted=self.images_accepted,
+        )
 
 
 def image_to_send(record: EncodedImage) -> ImageToSend:

@@ -14,21 +14,35 @@ from builders.fake_modem import FakeModem
 
 from sonarpost.modem.interface import SentenceRejected
 from sonarpost.modem.micromodem import MicroModem, MicroModemConfig
-from sonarpost.runtime.modem_service import ModemService, ModemServiceConfig
+from sonarpost.runtime.modem_service import ModemServiceConfig, ServiceModem
+from sonarpost.runtime.service import Service
 
 PORT = "/dev/ttyUSB0"
 
 
-class Service(ModemService[ModemServiceConfig]):
-    """The base class alone."""
+class WithModem(Service[ModemServiceConfig]):
+    """A service that has a modem and nothing else."""
 
     NAME = "uuv_modem"
+
+    def __init__(self, platform, config):
+        super().__init__(platform, config.for_platform(platform))
+        self.modem = ServiceModem(self, lambda _: None)
 
     def handle(self, key, record, effects):
         raise NotImplementedError
 
-    def on_modem_event(self, event):
-        pass
+    def on_start(self):
+        self.modem.start()
+
+    def on_stop(self):
+        self.modem.stop()
+
+    def degraded_reason(self):
+        return self.modem.degraded_reason()
+
+    def warning(self):
+        return self.modem.warning()
 
 
 class Connected:
@@ -39,9 +53,8 @@ class Connected:
         self.modem = FakeModem(MicroModem(MicroModemConfig(address=3)))
         self._seen = 0
         # The port is not opened: the service has an open one and the driver of the simulated modem instead.
-        service._port = SimpleNamespace(is_open=True, error="")  # type: ignore[assignment]
-        service.modem = self.modem.driver  # type: ignore[assignment]
-        service.modem.failure, service.modem.failures = "", 0
+        service.modem._port = SimpleNamespace(is_open=True, error="")
+        service.modem._driver = self.modem.driver
         self.modem.driver.start(0.0)
         self.run(5.0)
 
@@ -50,7 +63,7 @@ class Connected:
         while self.modem.now < until_s:
             self.modem.run(min(until_s, self.modem.now + 1.0))
             for event in self.modem.events[self._seen :]:
-                self.service._on_event(event)
+                self.service.modem.report(event)
             self._seen = len(self.modem.events)
 
     def send(self):
@@ -65,7 +78,7 @@ class Connected:
 
 @pytest.fixture
 def connected(platform):
-    service = Service(platform("uuv-1"), ModemServiceConfig(port=PORT, address=3))
+    service = WithModem(platform("uuv-1"), ModemServiceConfig(port=PORT, address=3))
     yield Connected(service)
     service.stop()
 
@@ -74,7 +87,7 @@ def test_service_whose_port_is_in_use_is_degraded_until_the_port_is_free(platfor
     master, slave = pty.openpty()
     path = os.ttyname(slave)
     fcntl.flock(slave, fcntl.LOCK_EX)
-    service = Service(platform("uuv-1"), ModemServiceConfig(port=path, address=3))
+    service = WithModem(platform("uuv-1"), ModemServiceConfig(port=path, address=3))
     try:
         assert service.start()
         eventually(lambda: "in use by" in service.health().detail)
@@ -140,7 +153,7 @@ def test_unreported_transmissions_are_in_health(connected):
 def test_log_lines_on_garbage_are_limited(connected, caplog):
     for n in range(5000):
         for event in connected.modem.driver.receive(b"\xff\x00$garbage %d\r\n" % n, 5.0):
-            connected.service._on_event(event)
+            connected.service.modem.report(event)
     rejected = connected.service.health().counters["sentences_rejected"]
     assert rejected >= 5000
     connected.service._health.flush_logs(stopping=True)

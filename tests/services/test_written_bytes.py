@@ -10,13 +10,13 @@ from builders.records import encoded_image
 from builders.vessel_frames import CONTACT, packet, preview_frame, received
 
 from sonarpost import keys, wire
-from sonarpost.config import PlatformConfig
 from sonarpost.delivery.store import Store
 from sonarpost.link.downlink.messages import image_of_number
 from sonarpost.link.received_image import received_image
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import CodedImage, ReceivedImage
 from sonarpost.modem.interface import FrameDecoded
+from sonarpost.runtime.saved_endpoint import SavedEndpoint
 from sonarpost.services.decompressor.config import DecompressorConfig
 from sonarpost.services.decompressor.service import DecompressorService
 from sonarpost.services.op_modem.config import OpModemConfig
@@ -73,24 +73,23 @@ def test_frame_received_by_op_modem(runner, platform, modem_pair, frames_in_pack
 
 def test_frame_sent_by_uuv_modem(tmp_path):
     store = Store(tmp_path / "uuv_modem.db", page_bytes=UuvModemService.PAGE_BYTES)
-    endpoint = VehicleEndpoint(PlatformConfig(id="uuv-1"), UuvModemConfig(port="unused", rate=1), store)
+    link = SavedEndpoint(store, "link/", lambda: VehicleEndpoint("uuv-1", UuvModemConfig(port="unused", rate=1)))
 
     def commit():
-        effects = endpoint.take_changes()
         with store.transaction() as tx:
-            effects.write(tx)
+            link.changes().write(tx)
 
     def add_images(first, last):
-        with endpoint.step():
+        with link.step() as endpoint:
             for number in range(first, last + 1):
                 endpoint.add(encoded_image(number, 500), 0.0)
             commit()
 
     def send(now):
-        with endpoint.step():
+        with link.step() as endpoint:
             frames = endpoint.next_packet(now).frames
             commit()
-        with endpoint.step():
+        with link.step() as endpoint:
             endpoint.packet_sent(frames, 6.0)
             commit()
         return len(frames)
@@ -104,7 +103,7 @@ def test_frame_sent_by_uuv_modem(tmp_path):
     few = written_per_frame(10.0)
     add_images(11, CONTACTS)
     many = written_per_frame(1000.0)
-    assert endpoint.queue.images_waiting > CONTACTS - 30
+    assert link.current.queue.images_waiting > CONTACTS - 30
     assert max(few, many) <= 4096
     assert many <= 1.5 * few
     store.close()

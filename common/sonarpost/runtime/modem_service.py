@@ -1,10 +1,9 @@
-"""Base class of the services that drive a modem: the port, the driver, and their state in health and log."""
+"""The modem of a service: its configuration, and its state in health and log."""
 
 from __future__ import annotations
 
 import logging
-from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable
 from typing import Annotated, ClassVar, Self, TypeVar
 
 from pydantic import Field, PrivateAttr
@@ -23,7 +22,6 @@ from sonarpost.runtime.service import Service
 from sonarpost.security.acoustic_key import UNAUTHENTICATED, link_key
 
 log = logging.getLogger(__name__)
-
 
 Seconds = Annotated[float, Field(gt=0, le=86400)]
 
@@ -58,11 +56,21 @@ class ModemServiceConfig(ServiceConfig):
         """Check the driver, the kind of the port and the acoustic key.
 
         Raises:
-            ConfigError: As `ModemService`.
+            ConfigError: Unknown driver, an address or rate that its modem does not have, unsupported kind of URL, no
+                acoustic key is configured, or its file cannot be read or is not private to its owner.
         """
         self.for_modem(modem_driver(platform.modem.driver).capabilities)
         open_modem_port(self.port, self.baud)
         link_key(platform)
+
+    def for_platform(self, platform: PlatformConfig) -> Self:
+        """Return this table for the modem of a platform, completely checked; see `for_modem`.
+
+        Raises:
+            ConfigError: See `check_with`.
+        """
+        self.check_with(platform)
+        return self.for_modem(modem_driver(platform.modem.driver).capabilities)
 
     @property
     def capabilities(self) -> ModemCapabilities:
@@ -112,121 +120,112 @@ class ModemServiceConfig(ServiceConfig):
 M = TypeVar("M", bound=ModemServiceConfig)
 
 
-class ModemService(Service[M]):
-    """A service that drives a modem. Subclasses handle events in `on_modem_event`.
+class ServiceModem(ModemRunner):
+    """The modem of a service: logs, counts and reports what happens to it.
 
     Attributes:
         key: Authenticates acoustic frames; None with `acoustic_auth = "none"`.
 
-    Raises:
-        ConfigError: Unknown driver, an address or rate that its modem does not have, unsupported kind of URL, no
-            acoustic key is configured, or its file cannot be read or is not private to its owner.
+    Args:
+        service: The service; its configuration has passed `for_platform`.
+        on_event: Called with each event of the driver, in the thread of the modem.
     """
 
-    def __init__(self, platform: PlatformConfig, config: M) -> None:
-        # Before the store is opened, so that a configuration error leaves no open store.
-        driver = modem_driver(platform.modem.driver)
-        config = config.for_modem(driver.capabilities)
-        self._port = open_modem_port(config.port, config.baud)
+    def __init__(self, service: Service[M], on_event: Callable[[ModemEvent], None]) -> None:
+        config, platform = service.config, service.platform
+        port = open_modem_port(config.port, config.baud)
+        settings = ModemSettings(config.address, config.reply_timeout_s, config.max_carrier_sense_s, port.STREAM)
+        driver = modem_driver(platform.modem.driver).create(settings, config.port)
+        super().__init__(driver, port, self.report)
         self.key = link_key(platform)
-        super().__init__(platform, config)
-        settings = ModemSettings(config.address, config.reply_timeout_s, config.max_carrier_sense_s, self._port.STREAM)
-        self.modem = ModemRunner(driver.create(settings, config.port), self._port, self._on_event)
-        self._modem_error = f"{config.port}: no reply from the modem yet"
+        self._url = config.port
+        self._on_service_event = on_event
+        self._count = service.count
+        self._error = f"{config.port}: no reply from the modem yet"
         self._transmit_failure = ""
         self._carrier_warning = ""
         self._report_warning = ""
-        self._rejected_lines = self.interval_log(log, logging.WARNING, "Line from the modem rejected")
-        self._modem_errors = self.interval_log(log, logging.WARNING, "Modem reports an error")
-        self._unreported_packets = self.interval_log(
+        self._rejected_lines = service.interval_log(log, logging.WARNING, "Line from the modem rejected")
+        self._modem_errors = service.interval_log(log, logging.WARNING, "Modem reports an error")
+        self._unreported_packets = service.interval_log(
             log, logging.WARNING, "Modem does not report the end of a transmission; the air time is used"
         )
-        self._ignored_receptions = self.interval_log(
+        self._ignored_receptions = service.interval_log(
             log, logging.WARNING, "Modem reports a busy channel without a pause; transmitting"
         )
 
-    @abstractmethod
-    def on_modem_event(self, event: ModemEvent) -> None:
-        """Handle an event of the driver; called in the modem's thread."""
-
     @override
-    def on_start(self) -> None:
+    def start(self) -> None:
         """Open the port, and log how acoustic frames are authenticated."""
         if self.key is None:
             log.warning("Acoustic link is unauthenticated", extra=kv(reason=UNAUTHENTICATED))
         else:
             log.info("Acoustic frames are authenticated", extra=kv(key_fingerprint=self.key.fingerprint))
-        self.modem.start()
+        super().start()
 
-    @override
-    def on_stop(self) -> None:
-        self.modem.stop()
-
-    @override
-    def gauges(self) -> Mapping[str, float]:
+    def gauges(self) -> dict[str, float]:
         """Return whether the modem is ready, and whether the link is unauthenticated."""
         return {
-            "modem_ready": float(self.modem.ready),
-            "modem_driver_failures": float(self.modem.failures),
+            "modem_ready": float(self.ready),
+            "modem_driver_failures": float(self.failures),
             "unauthenticated": float(self.key is None),
         }
 
-    @override
     def degraded_reason(self) -> str:
         """Return why the port or the modem does not work."""
         if not self._port.is_open:
-            return f"{self.config.port}: {self._port.error or 'not open yet'}"
-        if self.modem.failure:
-            return f"{self.config.port}: {self.modem.failure}"
-        return self._transmit_failure or ("" if self.modem.ready else self._modem_error)
+            return f"{self._url}: {self._port.error or 'not open yet'}"
+        if self.failure:
+            return f"{self._url}: {self.failure}"
+        return self._transmit_failure or ("" if self.ready else self._error)
 
-    @override
     def warning(self) -> str:
         """Return what the modem reports wrongly. The gauge `unauthenticated` states that the link has no key."""
         return "; ".join(text for text in (self._carrier_warning, self._report_warning) if text)
 
-    def _on_event(self, event: ModemEvent) -> None:
+    def report(self, event: ModemEvent) -> None:
+        """Log, count and store for health an event of the driver, and pass it to the service."""
         match event:
             case ev.ModemReady():
-                log.info("Modem ready", extra=kv(port=self.config.port, address=event.address, firmware=event.firmware))
+                log.info("Modem ready", extra=kv(port=self._url, address=event.address, firmware=event.firmware))
             case ev.ModemUnresponsive():
-                self._modem_error = f"{self.config.port}: no valid reply to {event.waiting_for}"
-                self.count("modem_unresponsive")
-                log.error("Modem does not reply", extra=kv(port=self.config.port, waiting_for=event.waiting_for))
+                self._error = f"{self._url}: no valid reply to {event.waiting_for}"
+                self._count("modem_unresponsive")
+                log.error("Modem does not reply", extra=kv(port=self._url, waiting_for=event.waiting_for))
             case ev.ModemRebooted():
-                self.count("modem_restarts")
+                self._count("modem_restarts")
                 log.warning("Modem restarted", extra=kv(firmware=event.firmware))
             case ev.SettingUnconfirmed():
                 log.warning("Modem did not confirm a setting", extra=kv(command=event.command))
             case ev.ModemError():
-                self.count("modem_errors")
+                self._count("modem_errors")
                 self._modem_errors.log(error=event.text)
             case ev.SentenceRejected():
-                self.count("sentences_rejected")
+                self._count("sentences_rejected")
                 self._rejected_lines.log(reason=str(event.error))
             case _:
                 self._on_transmit_event(event)
-        self.on_modem_event(event)
+        self._on_service_event(event)
 
     def _on_transmit_event(self, event: ModemEvent) -> None:
         """Log, count and store for health whether the modem transmits."""
-        port = self.config.port
+        port = self._url
         match event:
             case ev.TransmissionFailing():
                 self._transmit_failure = f"{port}: the modem does not transmit: {event.reason}"
-                self.count("modem_transmit_failures")
+                self._count("modem_transmit_failures")
                 log.error(
                     "Modem does not transmit", extra=kv(port=port, failures=event.failures, reason=str(event.reason))
                 )
             case ev.RestartRequested():
-                self.count("modem_restarts_requested")
+                self._count("modem_restarts_requested")
                 log.warning("Restarting the modem", extra=kv(port=port))
             case ev.TransmissionRecovered():
                 self._transmit_failure = ""
                 log.info("Modem transmits again", extra=kv(port=port, failures=event.failures, after_s=event.failing_s))
             case ev.CarrierSenseIgnored():
                 self._carrier_warning = f"{port}: the modem reports a busy channel without a pause"
-                self.count("carrier_sense_ignored")
+                self._count("carrier_sense_ignored")
                 self._ignored_receptions.log(port=port, busy_s=event.busy_s)
             case ev.CarrierSenseRestored():
                 self._carrier_warning = ""
@@ -235,7 +234,7 @@ class ModemService(Service[M]):
                 self._report_warning = ""
                 if not event.end_reported:
                     self._report_warning = f"{port}: the modem does not report the end of transmissions"
-                    self.count("packets_unreported")
+                    self._count("packets_unreported")
                     self._unreported_packets.log(port=port)
             case _:
                 pass

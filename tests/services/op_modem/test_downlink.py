@@ -33,7 +33,7 @@ from sonarpost.runtime.modem_runner import ModemRunner
 from sonarpost.runtime.serial_port import SerialPort
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.op_modem.config import OpModemConfig
-from sonarpost.services.op_modem.transmit_gate import TransmitGate
+from sonarpost.services.op_modem.transmission import TransmitGate
 
 VESSEL = "vessel-1"
 RX, IMAGE = keys.acoustic_rx(VESSEL), keys.acoustic_image(VESSEL)
@@ -275,7 +275,7 @@ def test_record_that_can_never_be_sent_is_rejected(begin):
 
 def test_command_is_validated_while_the_link_is_locked(begin, console, states):
     service = begin()
-    with service._link_lock:
+    with service._link.lock:
         # The inbox validates inside a transaction while another thread holds the lock and will open a transaction.
         console.send(keys.command(VESSEL, "refine"), "op_modem", command())
         eventually(lambda: service.store.inbox_depth() == 1, what="command in the inbox")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import pytest
 from builders.acoustic_attack import forged_contact, genuine_frames
 from builders.common import eventually
@@ -10,7 +12,7 @@ from pydantic import ValidationError
 
 from sonarpost import keys, wire
 from sonarpost.delivery.transaction import UnitOfWork
-from sonarpost.errors import ConfigError
+from sonarpost.errors import ConfigError, DeliveryError
 from sonarpost.messages import AcousticFrame, Command
 from sonarpost.security.acoustic_key import read_key
 from sonarpost.services.op_modem.config import OpModemConfig
@@ -128,7 +130,9 @@ def test_frames_of_other_senders_and_plain_publications_are_not_accepted(vessels
 
 def test_frame_of_a_failed_commit_is_new_again(vessels, frames):
     lead, other = vessels
-    lead.handle(INBOX, record(frames[0]), UnitOfWork())  # not committed
+    with suppress(DeliveryError), lead._link.step():
+        lead.handle(INBOX, record(frames[0]), UnitOfWork())
+        raise DeliveryError("not committed")
     other.on_modem_event(packet(frames[0]))
     eventually(lambda: merged(lead) == 1)
     assert gauge(lead, "frames_duplicate") == 0

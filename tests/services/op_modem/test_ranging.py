@@ -12,9 +12,8 @@ from sonarpost.messages import VehicleRange
 from sonarpost.modem.interface import RangeMeasured, RequestDone, RequestFailed
 from sonarpost.modem.micromodem.driver import DRIVER
 from sonarpost.services.op_modem.config import OpModemConfig
-from sonarpost.services.op_modem.ranging import Ranging
 from sonarpost.services.op_modem.service import OpModemService
-from sonarpost.services.op_modem.transmit_gate import TransmitGate
+from sonarpost.services.op_modem.transmission import Ranging, TransmitGate
 
 VESSEL = "vessel-1"
 RANGE = keys.acoustic_range(VESSEL)

@@ -6,7 +6,6 @@ import sqlite3
 from contextlib import closing
 from dataclasses import replace
 
-import msgpack
 import numpy as np
 import pytest
 from builders.common import eventually
@@ -27,8 +26,8 @@ from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import AcousticFrame
 from sonarpost.modem.interface import FrameDecoded
 from sonarpost.modem.micromodem import LinkStatistics, nmea
-from sonarpost.services.op_modem import service as op_modem
-from sonarpost.services.op_modem.packets import quality_of
+from sonarpost.services.op_modem import reception
+from sonarpost.services.op_modem.reception import quality_of
 
 VESSEL = "vessel-1"
 RX = keys.acoustic_rx(VESSEL)
@@ -143,29 +142,29 @@ def test_unexpected_exception_about_a_frame_loses_that_frame_only(begin, decompr
     assert not service.failed
 
 
-@pytest.mark.parametrize("damaged", [b"", b"\xc1", b"x", msgpack.packb({"heard_utc_s": 1, "frames": [[1, 2]]})])
+@pytest.mark.parametrize("damaged", [b"", b"\xc1", b"x"])
 def test_state_that_cannot_be_read_does_not_stop_the_service(damaged, begin, runner, decompressor, refused):
     service = begin()
     runner.stop(service)
     store = Store(service.store.path)
     with store.transaction() as tx:
-        for name in ("packets", "arriving", "authenticated-since"):
+        for name in ("packets", "authenticated-since"):
             tx.put_state(name, damaged)
     store.close()
     service = begin()
     service.on_modem_event(packet(received(preview_frame(1), 1)))
     eventually(lambda: numbers(decompressor) == [(1, 1)])
-    assert {"state packets", "state arriving", "state authenticated-since"} == {key for key, _ in refused(service)}
-    assert service.health().counters["states_discarded"] == 3
+    assert {"state packets", "state authenticated-since"} == {key for key, _ in refused(service)}
+    assert service.health().counters["states_discarded"] == 2
 
 
 def test_packets_in_memory_have_shares_by_address(begin, monkeypatch, unwritable):
-    monkeypatch.setattr(op_modem, "MAX_UNSAVED", 4)
+    monkeypatch.setattr(reception, "MAX_UNSAVED", 4)
     service = begin()
     with unwritable(service):
         for number, source in enumerate([3, 3, 9, 9, 9, 9, 9, 9], start=1):
             service.on_modem_event(packet(preview_frame(number), src=source))
-        assert [each.src for each, _ in service._unsaved] == [3, 3, 9, 9]
+        assert [each.src for each, _ in service._reception._unsaved] == [3, 3, 9, 9]
 
 
 def test_invalid_frames_are_quarantined_and_block_nothing(begin, decompressor, observed, refused, caplog):
@@ -237,7 +236,7 @@ def test_packets_of_a_full_disk_are_stored_at_the_stop(begin, runner, decompress
 
 
 def test_memory_is_bounded_and_dropped_packets_are_counted(begin, monkeypatch, caplog, request, full_disk):
-    monkeypatch.setattr(op_modem, "MAX_UNSAVED", 5)
+    monkeypatch.setattr(reception, "MAX_UNSAVED", 5)
     service = begin()
     with full_disk(service):
         for number in range(1, 31):
@@ -321,7 +320,7 @@ def kill(runner, begin):
     return restart
 
 
-def test_kill_between_any_two_frames_loses_and_repeats_no_image(begin, kill, decompressor):
+def test_kill_between_any_two_packets_loses_and_repeats_no_image(begin, kill, decompressor):
     sender = V1Sender(SenderConfig(frame_bytes=64, channels=(LossChannel(0.2),), frames_per_image=6))
     for number in range(1, 4):
         stream = b"\x20" + np.random.default_rng(number).bytes(150)
@@ -337,34 +336,18 @@ def test_kill_between_any_two_frames_loses_and_repeats_no_image(begin, kill, dec
         if isinstance(e, ImageUpdate)
     ]
     service = begin()
-    partial = []
-    for count, data in enumerate(frames, start=1):
-        partial.append(received(data, len(partial) + 1))
-        service.on_modem_event(FrameDecoded(partial[-1]))
-        if count % 3 == 0:
-            service = kill(service)  # inside a packet: the next start processes its frames
-            partial = []
-        elif len(partial) == 2 and count % 2 == 0:
-            service.on_modem_event(packet(*partial))
-            partial = []
-            if count % 4 == 0:
-                service = kill(service)  # between two packets
-    service.on_modem_event(packet(*partial))
+    for first in range(0, len(frames), 3):
+        service.on_modem_event(packet(*frames[first : first + 3]))
+        service = kill(service)
     eventually(lambda: len(decompressor.received) >= len(expected))
     assert [(i.image_id, i.version, i.stream) for i in decompressor.received] == expected
     assert {i.image_id for i in decompressor.received if i.complete} == {image_of_number(n) for n in (1, 2, 3)}
 
 
-def test_unfinished_packet_is_published_after_a_kill_without_statistics(begin, kill, observed):
+def test_frames_of_an_unfinished_packet_are_lost_with_a_kill_and_the_next_packet_arrives(begin, kill, observed):
     service = begin()
-    for number, data in enumerate((b"first", b"second"), start=1):
-        service.on_modem_event(FrameDecoded(received(data, number)))
-    assert observed() == []
+    service.on_modem_event(FrameDecoded(received(b"lost", 1)))
     service = kill(service)
-    eventually(lambda: len(observed()) == 2)
-    assert [(f.data, f.frame_number, f.rate, f.quality, f.frame_count) for f in observed()] == [
-        (b"first", 1, 1, None, None),
-        (b"second", 2, 1, None, None),
-    ]
     service.on_modem_event(packet(b"after"))
-    eventually(lambda: [f.packet for f in observed()] == [1, 1, 2])
+    eventually(lambda: [f.data for f in observed()] == [b"after"])
+    assert service.store.get_state("packets") == b"1"

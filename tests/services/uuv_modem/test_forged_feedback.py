@@ -7,7 +7,6 @@ from builders.authentication_world import key
 from builders.records import encoded_image
 from builders.v1_world import feedback_frame
 
-from sonarpost.config import PlatformConfig
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
 from sonarpost.link.frames.v1.payload_objects import Feedback
@@ -22,24 +21,25 @@ PACKET_S = 6.1
 class Vehicle:
     """A vehicle's endpoint with 24 images to send, and a clock."""
 
-    def __init__(self, store, *, authenticated):
+    def __init__(self, *, authenticated):
         config = UuvModemConfig(port="unused", group_delay_s=0.0)
-        self.key = key("fleet") if authenticated else None
-        self.endpoint = VehicleEndpoint(PlatformConfig(id="uuv-1"), config, store, self.key)
+        authenticator = None
+        if authenticated:
+            authenticator = FrameAuthenticator(key("fleet"), config.address, Direction.FROM_VEHICLE)
+            authenticator.grant(10_000)
+        self.endpoint = VehicleEndpoint("uuv-1", config, authenticator)
         self.now = 1e9
         self.frames = 0
-        with self.endpoint.step():
-            for number in range(1, IMAGES + 1):
-                self.endpoint.add(encoded_image(number), self.now)
+        for number in range(1, IMAGES + 1):
+            self.endpoint.add(encoded_image(number), self.now)
 
     def send(self, packets):
         """Send packets until there is nothing to send, at most so many."""
         for _ in range(packets):
-            with self.endpoint.step():
-                packet = self.endpoint.next_packet(self.now)
-                if packet is None:
-                    return
-                self.endpoint.packet_sent(packet.frames, PACKET_S)
+            packet = self.endpoint.next_packet(self.now)
+            if packet is None:
+                return
+            self.endpoint.packet_sent(packet.frames, PACKET_S)
             self.frames += len(packet.frames)
             self.now += PACKET_S
 
@@ -47,17 +47,16 @@ class Vehicle:
         """Receive two messages which say that nothing of any block is missing."""
         for newest in (15, 31):
             frame = feedback_frame(Feedback(newest, self.frames // 2, (0,) * 16), protection)
-            with self.endpoint.step():
-                self.endpoint.receive(VESSEL, frame, self.now)
+            self.endpoint.receive(VESSEL, frame, self.now)
 
     @property
     def rejected(self):
-        counts = self.endpoint.take_changes().counts
+        counts = self.endpoint.take_effects().counts
         return counts["frames_rejected"] + counts["frames_forged"]
 
 
-def test_forged_feedback_ends_an_unauthenticated_queue(store):
-    vehicle = Vehicle(store, authenticated=False)
+def test_forged_feedback_ends_an_unauthenticated_queue():
+    vehicle = Vehicle(authenticated=False)
     vehicle.send(10)
     vehicle.receive_forged_feedback(None)
     vehicle.send(600)
@@ -65,15 +64,14 @@ def test_forged_feedback_ends_an_unauthenticated_queue(store):
 
 
 @pytest.mark.parametrize("with_a_tag", [False, True])
-def test_forged_feedback_does_not_end_an_authenticated_queue(store, with_a_tag):
-    vehicle = Vehicle(store, authenticated=True)
+def test_forged_feedback_does_not_end_an_authenticated_queue(with_a_tag):
+    vehicle = Vehicle(authenticated=True)
     vehicle.send(10)
     before = vehicle.endpoint.queue.images_waiting
     foreign = FrameAuthenticator(key("another fleet"), VESSEL, Direction.TO_VEHICLE)
     foreign.grant(100)
     vehicle.receive_forged_feedback(foreign if with_a_tag else None)
-    with vehicle.endpoint.step():
-        vehicle.endpoint.receive_mini(VESSEL, 0, vehicle.now)  # has no tag
+    vehicle.endpoint.receive_mini(VESSEL, 0, vehicle.now)  # has no tag
     assert vehicle.rejected == 3
     assert vehicle.endpoint.queue.images_waiting == before
     assert not vehicle.endpoint.queue.is_idle

@@ -125,7 +125,7 @@ def test_restart_during_an_image_continues_with_the_next_packet(received, start_
     assert list(dict.fromkeys(data)) == list(dict.fromkeys(flat(packets)))
     # Only the packet in flight at the stop can be sent twice.
     assert len(data) - len(packets) in (0, 1)
-    assert again.store.state_names("paper/queue/image/") == ()
+    assert again.store.state_names("link/paper/queue/image/") == ()
 
 
 def test_image_is_sent_from_its_beginning_after_a_change_of_rate(received, start_service, runner, compressor, encoded):

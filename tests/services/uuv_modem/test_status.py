@@ -27,7 +27,7 @@ from sonarpost.modem.micromodem import RATES
 from sonarpost.security.acoustic_key import create_key, read_key
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.service import AtdStubService
-from sonarpost.services.op_modem.received_statuses import StatusLimiter, status_record
+from sonarpost.services.op_modem.reception import StatusLimiter, status_record
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.status_beacon import FRESH_S, StatusBeacon
 

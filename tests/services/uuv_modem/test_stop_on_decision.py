@@ -7,7 +7,6 @@ from collections import Counter
 import pytest
 from builders.records import command_record, decision_record, encoded_image
 
-from sonarpost.config import PlatformConfig
 from sonarpost.link.downlink.commands import CommandState
 from sonarpost.services.op_modem.config import OpModemConfig
 from sonarpost.services.op_modem.vessel_endpoint import VesselLink
@@ -21,20 +20,18 @@ STREAM_BYTES = 600
 class Link:
     """Both ends of a channel without loss, and a clock. The vessel sends after each packet of the vehicle."""
 
-    def __init__(self, store, **config):
-        self.store = store
+    def __init__(self, **config):
         self.config = UuvModemConfig(port="unused", group_delay_s=0.0, stream_bytes=STREAM_BYTES, **config)
-        self.vehicle = VehicleEndpoint(PlatformConfig(id="uuv-1"), self.config, store)
+        self.vehicle = VehicleEndpoint("uuv-1", self.config)
         self.vessel = VesselLink("vessel-1", OpModemConfig(port="unused", vehicles={"3": "uuv-1"}))
         self.now = 1e9
         self.received: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()
 
     def add(self, *numbers):
-        with self.vehicle.step():
-            self.vehicle.queue.sender.expect_feedback(expected=True)
-            for number in numbers:
-                self.vehicle.add(encoded_image(number, STREAM_BYTES), self.now)
+        self.vehicle.queue.sender.expect_feedback(expected=True)
+        for number in numbers:
+            self.vehicle.add(encoded_image(number, STREAM_BYTES), self.now)
 
     def decide(self, number, verdict, issued_s=None):
         decided_s = self.now if issued_s is None else issued_s
@@ -48,25 +45,19 @@ class Link:
         sent = 0
         for _ in range(packets):
             self.now += PACKET_S
-            with self.vehicle.step():
-                packet = self.vehicle.next_packet(self.now)
-                if packet is not None:
-                    self.vehicle.packet_sent(packet.frames, PACKET_S)
-                    sent += 1
+            packet = self.vehicle.next_packet(self.now)
+            if packet is not None:
+                self.vehicle.packet_sent(packet.frames, PACKET_S)
+                sent += 1
             for frame in packet.frames if packet else ():
                 for image in self.vessel.endpoint.accept(3, frame, self.now).images:
                     self.received[image.image_id] = len(image.stream)
             answer = self.vessel.endpoint.next_packet(3, 32, self.now)
             if answer is not None:
                 self.vessel.endpoint.sent(answer, self.now)
-                with self.vehicle.step():
-                    for frame in answer.frames:
-                        self.vehicle.receive(1, frame, self.now)
-            with self.vehicle.step():
-                effects = self.vehicle.take_changes()
-            self.counts.update(effects.counts)
-            with self.store.transaction() as tx:
-                effects.write(tx)
+                for frame in answer.frames:
+                    self.vehicle.receive(1, frame, self.now)
+            self.counts.update(self.vehicle.take_effects().counts)
         return sent
 
     def run_until_previewed(self, images):
@@ -82,8 +73,8 @@ class Link:
         return command.state
 
 
-def test_final_verdicts_stop_their_images_and_are_confirmed(store):
-    link = Link(store)
+def test_final_verdicts_stop_their_images_and_are_confirmed():
+    link = Link()
     link.add(1, 2, 3)
     link.run_until_previewed(3)
     decisions = [link.decide(1, "not_mine_like"), link.decide(2, "mine_like"), link.decide(3, "unsure")]
@@ -95,12 +86,11 @@ def test_final_verdicts_stop_their_images_and_are_confirmed(store):
     assert link.received["0003"] == STREAM_BYTES
     assert link.vessel.endpoint.incomplete_images == 0
     assert link.vessel.endpoint.feedback_open == 0
-    with link.vehicle.step():
-        assert link.vehicle.queue_state(link.now).images == ()
+    assert link.vehicle.queue_state(link.now).images == ()
 
 
-def test_vessel_does_not_wait_for_a_stopped_image_of_a_group_of_its_own(store):
-    link = Link(store)
+def test_vessel_does_not_wait_for_a_stopped_image_of_a_group_of_its_own():
+    link = Link()
     link.add(1)
     link.run_until_previewed(1)
     link.decide(1, "not_mine_like")
@@ -117,8 +107,8 @@ def test_vessel_does_not_wait_for_a_stopped_image_of_a_group_of_its_own(store):
     assert link.vessel.endpoint.incomplete_images == 0
 
 
-def test_late_copy_of_a_withdrawn_verdict_stops_nothing(store):
-    link = Link(store)
+def test_late_copy_of_a_withdrawn_verdict_stops_nothing():
+    link = Link()
     link.add(1, 2)
     link.run_until_previewed(2)
     link.decide(1, "unsure")
@@ -129,8 +119,8 @@ def test_late_copy_of_a_withdrawn_verdict_stops_nothing(store):
     assert link.received["0001"] == STREAM_BYTES
 
 
-def test_prioritised_image_is_completed_first(store):
-    link = Link(store)
+def test_prioritised_image_is_completed_first():
+    link = Link()
     link.add(1, 2, 3, 4)
     link.run_until_previewed(4)
     command = command_record("prioritise", "0003", command_id="c-1", issued_utc_s=link.now, place="first")
@@ -145,8 +135,8 @@ def test_prioritised_image_is_completed_first(store):
     assert found.state is CommandState.CONFIRMED
 
 
-def test_option_switches_the_stop_off(store):
-    link = Link(store, stop_on_decision=False)
+def test_option_switches_the_stop_off():
+    link = Link(stop_on_decision=False)
     link.add(1)
     link.run_until_previewed(1)
     decision = link.decide(1, "not_mine_like")
@@ -155,13 +145,15 @@ def test_option_switches_the_stop_off(store):
     assert link.received["0001"] == STREAM_BYTES
 
 
-def test_stop_survives_a_restart(store):
-    link = Link(store)
+def test_stop_survives_a_restart():
+    link = Link()
     link.add(1, 2)
     link.run_until_previewed(2)
     link.decide(1, "not_mine_like")
     link.run(3)
-    link.vehicle = VehicleEndpoint(PlatformConfig(id="uuv-1"), link.config, store)
+    parts = link.vehicle.parts()
+    link.vehicle = VehicleEndpoint("uuv-1", link.config)
+    assert not link.vehicle.restore(parts)
     parts = link.vessel.parts()
     link.vessel = VesselLink("vessel-1", OpModemConfig(port="unused", vehicles={"3": "uuv-1"}))
     assert not link.vessel.restore(parts)
