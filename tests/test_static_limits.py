@@ -53,7 +53,7 @@ READS = {
     "common/sonarpost/cli/c2/migrate.py": "decision of the archive",
     "common/sonarpost/cli/deployment/config_files.py": SHIPPED,
     "common/sonarpost/cli/deployment/install_units.py": SHIPPED,
-    "common/sonarpost/cli/detection/transmissions.py": OWN_SETTINGS,
+    "common/sonarpost/cli/detection/options.py": OWN_SETTINGS,
     "common/sonarpost/cli/encode.py": "its size is compared with MAX_STREAM_FILE_BYTES first",
     "common/sonarpost/codec/code_cache.py": SHIPPED,
     "common/sonarpost/codec/compiled_library.py": SHIPPED,

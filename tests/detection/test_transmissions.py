@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sonarpost.cli.detection.transmissions import read_transmissions
+from sonarpost.cli.detection.options import read_transmissions
 from sonarpost.cli.main import main
 from sonarpost.detection.detector import detect
 from sonarpost.detection.stream import FileOrigin, StreamDetector

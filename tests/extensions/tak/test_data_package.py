@@ -24,12 +24,12 @@ from sonarpost.export.contacts import load_contacts
 from sonarpost.export.formats import write_export
 from sonarpost.extensions.tak.data_package import (
     MANIFEST,
+    TakFiles,
     UploadedPackage,
     attachment_sha256,
     data_package,
     file_transfer_event,
 )
-from sonarpost.extensions.tak.tak_files import TakFiles
 
 NOW_S = 1_700_000_000.0
 

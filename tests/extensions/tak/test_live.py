@@ -26,8 +26,7 @@ from sonarpost.errors import PortError
 from sonarpost.export.live import LiveContacts
 from sonarpost.extensions.tak import command
 from sonarpost.extensions.tak.command import MAX_IMAGES, REFRESH_S, RETRY_S, CotService
-from sonarpost.extensions.tak.data_package import UploadedPackage, attachment_sha256
-from sonarpost.extensions.tak.tak_files import PackageRefusedError
+from sonarpost.extensions.tak.data_package import PackageRefusedError, UploadedPackage, attachment_sha256
 
 
 def contact_of(image_id="00A7", vessel_id="vessel-1", **fields):

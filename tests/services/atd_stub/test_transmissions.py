@@ -12,7 +12,7 @@ from builders.common import eventually
 from builders.joined_surveys import Box, near, survey_of
 
 from sonarpost import keys, wire
-from sonarpost.cli.detection.transmissions import read_transmissions
+from sonarpost.cli.detection.options import read_transmissions
 from sonarpost.delivery.store import Store
 from sonarpost.errors import DeliveryError
 from sonarpost.messages import Transmission, Transmissions

@@ -21,9 +21,13 @@ from PIL import Image, ImageDraw
 from pydantic import ValidationError
 
 from sonarpost.cli.detection.images import add_image_options, check_image_options, run_images
-from sonarpost.cli.detection.picks import add_pick_option, contacts_of_picks, located_picks
-from sonarpost.cli.detection.seabed import seabed_json, seabed_text
-from sonarpost.cli.detection.transmissions import add_transmission_options, transmissions_of
+from sonarpost.cli.detection.options import (
+    add_pick_option,
+    add_transmission_options,
+    contacts_of_picks,
+    located_picks,
+    transmissions_of,
+)
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import (
@@ -37,6 +41,7 @@ from sonarpost.cli.shared import (
 from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
 from sonarpost.detection.contact_map import ContactMap, contact_map
 from sonarpost.detection.detector import MINE_LIKE, Detection, counts_text
+from sonarpost.detection.difficulty import Difficulty, combined
 from sonarpost.detection.picks import PICKED, LocatedPick, PickedDetection
 from sonarpost.detection.record import contact_record
 from sonarpost.detection.settings import DetectorSettings, checked_settings, load_settings
@@ -412,3 +417,36 @@ def annotated_waterfall(source: SurveySource, detections: Sequence[Detection]) -
         confidence = PICKED if detection.atd_class == PICKED else f"{detection.confidence:.2f}"
         draw.text((frame[0], frame[3] + 1), f"{number}: {confidence}", fill=colour)
     return image
+
+
+def seabed_text(strips: Sequence[StripDifficulty], threshold: float) -> str:
+    """Return the difficulty of a file as one line."""
+    difficulty = combined(strip.difficulty for strip in strips)
+    if difficulty is None:
+        return "seabed: too little of it is known to state its difficulty"
+    return (
+        f"seabed: {difficulty.clutter_per_1000_m2:.0f} clutter echoes per 1000 m², "
+        f"ripples {difficulty.ripple_strength:.1f}, expected Pd {difficulty.expected_pd:.2f} at threshold {threshold:g}"
+    )
+
+
+def seabed_json(strips: Sequence[StripDifficulty], threshold: float) -> dict[str, object]:
+    """Return the difficulty of a file and of each side of its strips as JSON types; unknown values are None."""
+    return {
+        "threshold": threshold,
+        **_fields(combined(strip.difficulty for strip in strips)),
+        "strips": [
+            {
+                "first_ping": strip.first_row,
+                "end_ping": strip.end_row,
+                "channel": strip.side.value,
+                **_fields(strip.difficulty),
+            }
+            for strip in strips
+        ],
+    }
+
+
+def _fields(difficulty: Difficulty | None) -> dict[str, float | None]:
+    values = {} if difficulty is None else dataclasses.asdict(difficulty)
+    return {name: round(values[name], 3) if name in values else None for name in Difficulty.__dataclass_fields__}

@@ -8,11 +8,11 @@ from sonarpost.cli.parsing.commands import CommandSpec
 
 MOSAIC: Final = CommandSpec(
     "write a mosaic of the seabed as cloud-optimised GeoTIFF",
-    "sonarpost.extensions.maps.mosaic_command:add_options",
+    "sonarpost.extensions.maps.command:add_mosaic",
     "line.xtf --out mosaic.tif --coverage coverage.geojson",
 )
 COVERAGE: Final = CommandSpec(
     "write the covered seabed as polygons",
-    "sonarpost.extensions.maps.coverage_command:add_options",
+    "sonarpost.extensions.maps.command:add_coverage",
     "line.xtf --out coverage.gpkg",
 )

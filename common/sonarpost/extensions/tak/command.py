@@ -25,13 +25,14 @@ from sonarpost.export.text import utc_text
 from sonarpost.extensions.tak.cot import CotOptions, cot_event, cot_events
 from sonarpost.extensions.tak.cot_sender import MAX_BATCH, CotSender
 from sonarpost.extensions.tak.data_package import (
+    PackageRefusedError,
+    TakFiles,
     UploadedPackage,
     attachment_sha256,
     data_package,
     file_name,
     file_transfer_event,
 )
-from sonarpost.extensions.tak.tak_files import PackageRefusedError, TakFiles
 from sonarpost.limits import Turns, limit, oldest_of_largest
 from sonarpost.logs import kv
 from sonarpost.messages import Health, ServiceState

@@ -1,4 +1,4 @@
-"""`sonarpost survey coverage FILE...`: the covered seabed as polygons, GeoPackage or GeoJSON."""
+"""`sonarpost survey coverage` and `mosaic`: the covered seabed as polygons, a mosaic of it as GeoTIFF."""
 
 from __future__ import annotations
 
@@ -10,9 +10,15 @@ from typing import Final
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import add_survey_options, in_new_folder, option, survey_options_of
+from sonarpost.cli.survey.waterfall import check_resolution
 from sonarpost.errors import ConfigError
-from sonarpost.extensions.maps.coverage import CoveragePolygon, survey_coverage
-from sonarpost.extensions.maps.coverage_files import write_coverage_geojson, write_coverage_geopackage
+from sonarpost.extensions.maps.coverage import (
+    CoveragePolygon,
+    survey_coverage,
+    write_coverage_geojson,
+    write_coverage_geopackage,
+)
+from sonarpost.extensions.maps.mosaic import write_mosaic
 
 WRITERS: Final[Mapping[str, Callable[[Path, Sequence[CoveragePolygon]], None]]] = {
     ".gpkg": write_coverage_geopackage,
@@ -21,16 +27,16 @@ WRITERS: Final[Mapping[str, Callable[[Path, Sequence[CoveragePolygon]], None]]] 
 """Suffix -> function that writes the file."""
 
 
-def add_options(parser: CommandParser) -> None:
+def add_coverage(parser: CommandParser) -> None:
     """Add the action."""
     parser.description = "Write the outline of the swath, a polygon for each part of a line without gap, in WGS 84."
     option(parser, "files FILE", "survey file", Path, nargs="+")
     option(parser, "--out FILE", "file to write, named *.gpkg or *.geojson", Path, required=True)
     add_survey_options(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run_coverage)
 
 
-def run(parsed: argparse.Namespace) -> int:
+def run_coverage(parsed: argparse.Namespace) -> int:
     """Write the polygons; return 0.
 
     Raises:
@@ -64,3 +70,40 @@ def print_left_out(pings: int) -> None:
     """Print the number of pings that could not be placed, if there are any."""
     if pings:
         print(f"left out: {pings} pings without position, heading or altitude")
+
+
+def add_mosaic(parser: CommandParser) -> None:
+    """Add the action."""
+    option(parser, "files FILE", "survey file", Path, nargs="+")
+    option(parser, "--out FILE.tif", "the GeoTIFF to write", Path, required=True)
+    option(parser, "--resolution-m M", "side of a pixel in metres", float, 0.1)
+    option(parser, "--coverage FILE", "also write the covered area as polygons, *.gpkg or *.geojson", Path)
+    add_survey_options(parser)
+    parser.set_defaults(run=run_mosaic)
+
+
+def run_mosaic(parsed: argparse.Namespace) -> int:
+    """Write the mosaic; return 0.
+
+    Raises:
+        ConfigError: The resolution is out of range, or the name of the coverage has another suffix.
+        SurveyFileError: A recording cannot be read or positioned.
+    """
+    check_resolution(parsed.resolution_m, "survey mosaic")
+    write_coverage = None
+    if parsed.coverage is not None:
+        write_coverage = coverage_writer(parsed.coverage, "survey mosaic", "--coverage")
+        in_new_folder(parsed.coverage)
+    options = survey_options_of(parsed)
+    in_new_folder(parsed.out)
+    with ProgressDisplay(step="drawing the mosaic"):
+        result = write_mosaic(parsed.files, parsed.out, parsed.resolution_m, options)
+        if write_coverage is not None:
+            write_coverage(parsed.coverage, result.coverage.polygons)
+    height_px, width_px = result.size_px
+    print(
+        f"{parsed.out}: {width_px} x {height_px} px of {parsed.resolution_m:g} m, EPSG:{result.transform.epsg}, "
+        f"{result.coverage.pings} pings"
+    )
+    print_left_out(result.coverage.left_out)
+    return 0
