@@ -95,9 +95,3 @@ def test_steps_are_shown_and_no_step_is_silent(tmp_path):
     assert len(others) >= 3
     assert all(line.startswith("images: ") and line.endswith(" s: Collecting numpy") for line in others)
     assert len(set(others)) >= 2, "with the elapsed time"
-
-
-def test_failure_shows_the_last_lines_and_returns_the_status():
-    done = progress("", "seq 100; exit 9", FAILURE_LINES="3")
-    assert done.returncode == 9
-    assert done.stderr == "images: 98\nimages: 99\nimages: 100\n"

@@ -163,23 +163,6 @@ def test_manifests_have_the_fields_of_their_kinds(built):
     assert {place for manifest in built[1] for place in defects(manifest)} == set()
 
 
-@pytest.mark.parametrize(
-    ("change", "place"),
-    [
-        (lambda m: m["spec"].pop("selector"), "Service.spec.selector: missing"),
-        (lambda m: m["spec"].update(port=1), "Service.spec.port: unknown"),
-        (lambda m: m["spec"]["ports"][0].update(port="7447"), "Service.spec.ports[0].port: '7447'"),
-        (lambda m: m["spec"].update(type="Loadbalancer"), "Service.spec.type: 'Loadbalancer'"),
-        (lambda m: m["metadata"].update(name="A_b"), "Service.metadata.name: 'A_b'"),
-        (lambda m: m["spec"].update(ports={}), "Service.spec.ports: {}"),
-    ],
-)
-def test_wrong_field_is_named(change, place):
-    manifest = next(m for m in build(FOLDER / "base") if m["kind"] == "Service")
-    change(manifest)
-    assert defects(manifest) == [place]
-
-
 def workloads(manifests):
     return {m["metadata"]["name"]: m["spec"] for m in manifests if m["kind"] in ("Deployment", "StatefulSet")}
 
