@@ -71,28 +71,6 @@ def test_vessel_console_sends_decisions_and_commands_and_receives_comment(world,
     world.vessel.wait_for_denial("console-1", "Query", IMAGE)
 
 
-def test_shore_console_sends_comment_and_no_image(world, shore_session):
-    comment = keys.delivery_query(keys.tasking_comment(VESSEL), "c2")
-
-    def answer(query):
-        with query:
-            query.reply(query.key_expr, b"stored")
-
-    shore_session.declare_queryable(keys.delivery_query(keys.tasking_comment_all(), "c2"), answer)
-    shore_session.declare_queryable(keys.delivery_query(keys.shore_inbox_all(), "c2"), answer)
-    with world.open("console-1") as console:
-        eventually(lambda: answered(console, comment), what="the comment")
-        assert not answered(console, keys.delivery_query(keys.shore_inbox(VESSEL), "c2"))
-
-
-def test_other_vessels_and_vehicles_are_denied(world, relay):
-    for name in ("vessel-2", "uuv-1"):
-        with world.open(name, endpoint=world.vessel_tls) as stranger:
-            assert not any(answered(stranger, key) for key in (COMMENT, COMMAND, DECISION, IMAGE))
-        world.vessel.wait_for("Peer denied by access control", f"peer={name}")
-    assert relay == []
-
-
 def test_ca_file_can_hold_two_authorities_during_a_change(world, tmp_path):
     young = Fleet.init(tmp_path / "young", "young")
     folder = young.issue("vessel-9", "vessel").folder

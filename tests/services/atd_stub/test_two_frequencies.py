@@ -4,29 +4,15 @@ from __future__ import annotations
 
 import pytest
 from builders.joined_surveys import FEW_CANDIDATES, RANGE_M, SAMPLES, Box, detect_in_files, near, split, survey_of
-from builders.two_frequencies import files_of, with_second_frequency
+from builders.two_frequencies import with_second_frequency
 
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import StoredEnd, pack, unpack
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
 from sonarpost.sonar.readers import read_survey
-from sonarpost.sonar.survey import Side
 
 CONFIG = AtdStubConfig(join_timeout_s=30.0, detector=FEW_CANDIDATES)
 SECOND = pytest.mark.parametrize(("samples", "range_m"), [(SAMPLES, RANGE_M), (320, 12.5), (1024, 60.0)])
-
-
-@SECOND
-@pytest.mark.parametrize("ground", [False, True])
-def test_contacts_and_snippets_equal_those_of_the_first_frequency_alone(ground, samples, range_m, tmp_path):
-    survey = survey_of(300, Box(150), Box(210, Side.STARBOARD))
-    config = AtdStubConfig(snippet_pixel_m=0.1 if ground else 0.0, detector=FEW_CANDIDATES)
-    alone, both = (
-        detect_in_survey(path, "0" * 64, "uuv-1", config).snippets
-        for path in files_of(survey, tmp_path, samples, range_m)
-    )
-    assert len(near(list(both), 150)) == len(near(list(both), 210, Side.STARBOARD)) == 1
-    assert both == alone
 
 
 @SECOND
