@@ -1,7 +1,5 @@
 """`sonarpost c2`: live lines, tables, copies, exports, and commands and comments for a vessel."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """`sonarpost c2 migrate`, and the commands that read the archive, with PostgreSQL."""
 
-from __future__ import annotations
-
 import csv
 import json
 

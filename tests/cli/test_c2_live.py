@@ -1,7 +1,5 @@
 """Live contacts of a site, for commands that pass them on."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import zenoh

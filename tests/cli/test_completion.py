@@ -1,7 +1,5 @@
 """`sonarpost completion`: the script of each shell, run by the shell where it is installed."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 

@@ -1,7 +1,5 @@
 """`sonarpost dataset export`: images with verdicts of operators in COCO format."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`sonarpost encode` and `sonarpost decode`."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from pathlib import Path

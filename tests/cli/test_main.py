@@ -1,7 +1,5 @@
 """The `sonarpost` command as a whole."""
 
-from __future__ import annotations
-
 import logging
 import os
 import shlex

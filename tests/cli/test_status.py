@@ -1,7 +1,5 @@
 """`sonarpost status`: output on a terminal of 80 columns, for other programs, and a clean end."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

@@ -1,7 +1,5 @@
 """`sonarpost store`: check and salvage, on damaged stores."""
 
-from __future__ import annotations
-
 import os
 import re
 import sqlite3

@@ -1,7 +1,5 @@
 """Survey options: one file and one pair of options for `detect`, `survey`, `run atd_stub` and the vehicle."""
 
-from __future__ import annotations
-
 import json
 import os
 import runpy

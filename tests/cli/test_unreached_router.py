@@ -1,7 +1,5 @@
 """Every command that waits for a router prints why it is not reached."""
 
-from __future__ import annotations
-
 import pytest
 from builders.unreached_router import check_unreached_router
 

@@ -1,7 +1,5 @@
 """Rules for every extension: a README, entry points that load, tests of its own, requirements that its README names."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from importlib.metadata import EntryPoint

@@ -1,7 +1,5 @@
 """`sonarpost config`: examples from the package, and a check that reports every error."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

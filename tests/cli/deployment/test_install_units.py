@@ -1,7 +1,5 @@
 """`sonarpost install-units`: files, what it refuses to replace, and systemd's own verification."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -1,7 +1,5 @@
 """`sonarpost modem ping` with emulated modems."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import pty

@@ -1,7 +1,5 @@
 """`sonarpost run all`: which processes it starts, restarts after a crash, errors of the configuration, Ctrl-C."""
 
-from __future__ import annotations
-
 import io
 import os
 import signal

@@ -1,7 +1,5 @@
 """Attacks on the alerts; see `builders.hostile_rows`."""
 
-from __future__ import annotations
-
 from builders.hostile_rows import Row
 
 ROWS = (Row(("exchange:extensions.alerts.senders",), "vessel", "endless", "tests/extensions/alerts/test_attacks.py"),)

@@ -1,7 +1,5 @@
 """`sonarpost c2 alert`: live contacts for a webhook and an MQTT broker."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import json

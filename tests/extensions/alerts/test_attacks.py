@@ -1,7 +1,5 @@
 """Alerts about one vessel that are refused, or answered without an end, delay no other vessel."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Covered seabed: place and area of the outline, gaps, turns, files."""
 
-from __future__ import annotations
-
 import json
 import math
 import sqlite3

@@ -1,7 +1,5 @@
 """Mosaic: georeference, gaps, coverage, memory."""
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Attacks on the recorder; see `builders.hostile_rows`."""
 
-from __future__ import annotations
-
 from builders.hostile_rows import Row
 
 ROWS = (Row(("subscriber:extensions.mcap.record",), "vessel", "flood", "tests/extensions/mcap/test_record.py"),)

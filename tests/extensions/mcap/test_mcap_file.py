@@ -1,7 +1,5 @@
 """MCAP files of records: read by the `mcap` library, cut off, damaged, hostile."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import io

@@ -1,7 +1,5 @@
 """`sonarpost record` and `replay`: publications of a router into an MCAP file, to watchers, and into a running c2."""
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading

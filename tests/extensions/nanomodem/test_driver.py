@@ -1,7 +1,5 @@
 """The nanomodem driver: its messages, and its dialogue with the modem."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """The emulated nanomodem: its commands and its packets in the channel."""
 
-from __future__ import annotations
-
 import pytest
 
 from sonarpost.extensions.nanomodem.rates import airtime_s

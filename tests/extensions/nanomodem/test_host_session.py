@@ -4,8 +4,6 @@ The session was read from the source of the driver; the test replays it without 
 docs/reference/modem-nano.md names what was run.
 """
 
-from __future__ import annotations
-
 import re
 
 from builders.host_sessions import Hosts, Step, replay

@@ -1,7 +1,5 @@
 """The nanomodem driver, and another host, on emulated modems over TCP and pseudo-terminals, in accelerated time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Text in the form of CARIS contact files, and reports in the manner of APP-11."""
 
-from __future__ import annotations
-
 import re
 
 from builders.exports import decision, export, image, mission, store

@@ -1,7 +1,5 @@
 """The S2C driver and its emulated modem, for the suites of all modem drivers."""
 
-from __future__ import annotations
-
 from builders.host_sessions import HostInput, hears
 from builders.hostile_line import DATA_REQUESTS, DUMPS, PADDED, Subject
 

@@ -1,7 +1,5 @@
 """The S2C driver: its parser, its dialogue with the modem, and the commands of the emulated modem."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import pytest

@@ -1,7 +1,5 @@
 """Burst data of the emulated S2C modem on the simulated channel, and the command sequences of other clients."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

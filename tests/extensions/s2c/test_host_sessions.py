@@ -4,8 +4,6 @@ The sessions were read from the sources of the drivers; the tests replay them wi
 docs/reference/modem-s2c.md names those that were run.
 """
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Attacks on the reception of short messages at c2; see `builders.hostile_rows`."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager

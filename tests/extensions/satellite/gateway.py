@@ -5,8 +5,6 @@ that is not answered with 200. It accepts messages to terminals as RockBLOCK doe
 random, by a seed. Not modelled: antennas and visibility, sessions that fail, RING alerts.
 """
 
-from __future__ import annotations
-
 import heapq
 import re
 import threading

@@ -3,8 +3,6 @@
 `PYTHONPATH=tests python -m extensions.satellite.records` prints the golden file. It is added to, never changed.
 """
 
-from __future__ import annotations
-
 import binascii
 import json
 

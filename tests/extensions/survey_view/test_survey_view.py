@@ -1,7 +1,5 @@
 """`sonarpost survey view`: the page, its places and picks; requests of other pages; the command."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

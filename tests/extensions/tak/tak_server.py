@@ -1,7 +1,5 @@
 """A TAK server for tests, plain TCP or TLS, that can refuse, stop or ignore a client."""
 
-from __future__ import annotations
-
 import socket
 import struct
 import threading

@@ -1,7 +1,5 @@
 """`c2 cot` with servers of every kind: what is reported and received, and the exit status."""
 
-from __future__ import annotations
-
 import signal
 import ssl
 import subprocess

@@ -1,7 +1,5 @@
 """Cursor-on-Target events: agreement with their schema, golden files, untrusted text."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from xml.etree import ElementTree as ET

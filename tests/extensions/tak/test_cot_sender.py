@@ -1,7 +1,5 @@
 """The event sender with real sockets: what it reports equals what the server has received, for every kind of server."""
 
-from __future__ import annotations
-
 import socket
 import ssl
 import threading

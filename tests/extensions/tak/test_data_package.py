@@ -1,7 +1,5 @@
 """TAK data packages, their upload, and file transfer events."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import threading

@@ -1,7 +1,5 @@
 """`sonarpost c2 cot`: live contacts for a TAK endpoint."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import os

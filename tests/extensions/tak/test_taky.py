@@ -1,7 +1,5 @@
 """`sonarpost c2 cot` with a TAK server, taky: its clients receive the contacts and download their images."""
 
-from __future__ import annotations
-
 import hashlib
 import http.client
 import io

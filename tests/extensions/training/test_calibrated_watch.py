@@ -1,7 +1,5 @@
 """Calibrated watch: sealed contacts among those of the vehicles."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

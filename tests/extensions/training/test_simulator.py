@@ -1,7 +1,5 @@
 """Training: simulated contacts, their packets, requests and decisions."""
 
-from __future__ import annotations
-
 import time
 from itertools import islice
 

@@ -1,7 +1,5 @@
 """The channel emulator on pseudo-terminals and TCP ports: library, command and service."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import random

@@ -1,7 +1,5 @@
 """Absorption, noise and frame error rate against published values."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

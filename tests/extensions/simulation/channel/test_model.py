@@ -1,7 +1,5 @@
 """Channel model: travel time, half duplex, collisions, loss, damage and random draws."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

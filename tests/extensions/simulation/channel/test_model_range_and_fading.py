@@ -1,7 +1,5 @@
 """Channel model: loss by range, calibration to the sea trial of the paper, burst fading."""
 
-from __future__ import annotations
-
 import itertools
 
 import pytest

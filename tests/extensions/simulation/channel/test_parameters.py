@@ -1,7 +1,5 @@
 """Channel parameters: sonar equation, presets, files and bounds."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

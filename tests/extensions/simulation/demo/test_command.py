@@ -1,7 +1,5 @@
 """The demo command: errors in its arguments come before any work."""
 
-from __future__ import annotations
-
 import pytest
 
 from sonarpost.cli.main import main, parser

@@ -1,7 +1,5 @@
 """The outcome of a demo: which images count as missing, incomplete or not sent."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

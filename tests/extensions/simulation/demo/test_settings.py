@@ -1,7 +1,5 @@
 """Ports of the demo."""
 
-from __future__ import annotations
-
 import socket
 from itertools import islice
 

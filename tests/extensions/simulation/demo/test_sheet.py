@@ -1,7 +1,5 @@
 """The contact sheet of the demo."""
 
-from __future__ import annotations
-
 import numpy as np
 from PIL import Image
 

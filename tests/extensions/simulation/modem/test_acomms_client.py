@@ -1,7 +1,5 @@
 """WHOI's unmodified client on both modems of the emulator: every rate in both directions, byte for byte."""
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading

@@ -1,7 +1,5 @@
 """Serial line of the emulated modem: errors, arbitrary input, timing."""
 
-from __future__ import annotations
-
 import pytest
 from builders.emulator_bench import START_UTC_S, EmulatorBench
 from hypothesis import given

@@ -5,8 +5,6 @@ command after the other: each waits for a sentence of the same kind, a setting f
 for `CAREV`. Goby reads statistics of any version but 6 as of the first.
 """
 
-from __future__ import annotations
-
 import pytest
 from builders.emulator_bench import EmulatorBench
 

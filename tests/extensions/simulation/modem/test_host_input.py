@@ -1,7 +1,5 @@
 """Any bytes of a host: after a pause every emulated modem answers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import pytest

@@ -1,7 +1,5 @@
 """Receiving half of the emulated modem: bad frames, collisions, acknowledgements, data for other modems."""
 
-from __future__ import annotations
-
 import pytest
 from builders.emulator_bench import EmulatorBench
 

@@ -1,7 +1,5 @@
 """Text, flexible data, pings, mini-packets and transponders of the emulated modem."""
 
-from __future__ import annotations
-
 import pytest
 from builders.emulator_bench import START_UTC_S, EmulatorBench
 

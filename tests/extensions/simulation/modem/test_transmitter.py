@@ -1,7 +1,5 @@
 """Cycles of the emulated modem at every rate: commands, data, transmission and reports on both sides."""
 
-from __future__ import annotations
-
 import pytest
 from builders.emulator_bench import EmulatorBench, cst
 

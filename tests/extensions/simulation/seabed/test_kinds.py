@@ -1,7 +1,5 @@
 """Surveys with the kinds and receiver options that a survey contains only when they are named."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from functools import cache
