@@ -288,7 +288,7 @@ def run_mission(spec: MissionSpec) -> MissionResult:
     mission = _Mission(spec)
     vehicles = [_Vehicle(n + 1, spec, rng) for n in range(spec.vehicles)]
     cycle_s = (spec.vehicles + 1) * _SLOT_S
-    slots = [Tdma(cycle_s, n * _SLOT_S, _SLOT_S, _GUARD_S) for n in range(spec.vehicles)]
+    slots = [Tdma(cycle_s, n * _SLOT_S, (n + 1) * _SLOT_S - _GUARD_S) for n in range(spec.vehicles)]
     receiver = V1Receiver(ReceiverConfig(max_sources=16))
     now, hour, restarts, packets = 0.0, 0, 0, 0
     state_bytes: list[int] = []

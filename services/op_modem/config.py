@@ -10,7 +10,7 @@ from typing_extensions import override
 from sonarpost.config import ConsumerName, PlatformConfig
 from sonarpost.errors import ConfigError
 from sonarpost.link.config import ReceiverConfig
-from sonarpost.link.mac import Tdma
+from sonarpost.link.mac import Continuous, Csma, MediumAccess, Tdma
 from sonarpost.link.receiver import WireFormat
 from sonarpost.messages import Address, PlatformId, RateNumber
 from sonarpost.modem.interface import MAX_ADDRESS, ModemCapabilities
@@ -51,10 +51,6 @@ class OpModemConfig(ModemServiceConfig):
             each vehicle in turn and sends between the polls.
         holdoff_s: CSMA: minimum time without a received frame before a packet is sent.
         max_defer_s: CSMA: time after which a pending packet is sent between two received packets.
-        tdma_cycle_s: TDMA: length of the cycle of slots; cycles begin at multiples of it since 1970-01-01 UTC.
-        slot_start_s: TDMA: start of the vessel's slot in the cycle.
-        slot_s: TDMA: length of the slot.
-        guard_s: TDMA: guard time at the end of the slot.
         ranging_period_s: Time between two pings that measure the distance to a vehicle, 0 for none. The vehicles of
             `vehicles` are pinged in turn while the channel is free. Answers are not authenticated.
         sound_speed_mps: Mean sound speed in the water, for distances.
@@ -87,10 +83,7 @@ class OpModemConfig(ModemServiceConfig):
     mac: Literal["csma", "tdma", "polled"] = "csma"
     holdoff_s: Seconds = 2.0
     max_defer_s: Seconds = 120.0
-    tdma_cycle_s: Seconds = 60.0
-    slot_start_s: Annotated[float, Field(ge=0, le=86400)] = 50.0
-    slot_s: Seconds = 10.0
-    guard_s: Annotated[float, Field(ge=0, le=86400)] = 1.0
+    tdma_slot_s: tuple[Annotated[float, Field(ge=0)], float] = (50.0, 59.0)
     ranging_period_s: Annotated[float, Field(ge=0, le=86400)] = 0.0
     sound_speed_mps: Annotated[float, Field(ge=1300, le=1700)] = 1500.0
     poll_interval_s: Seconds = 10.0
@@ -107,8 +100,6 @@ class OpModemConfig(ModemServiceConfig):
             raise ValueError('other_vessels only with link = "v1" and without lead_vessel')
         if len(set(self.other_vessels)) != len(self.other_vessels):
             raise ValueError("each name in other_vessels once")
-        if self.mac == "tdma" and self.slot_start_s + self.slot_s > self.tdma_cycle_s:
-            raise ValueError(f"a slot that ends within tdma_cycle_s = {self.tdma_cycle_s}")
         if self.ranging_period_s and not self.transmits:
             raise ValueError('ranging_period_s = 0 where link = "paper": such a vessel does not transmit')
         return self
@@ -122,10 +113,7 @@ class OpModemConfig(ModemServiceConfig):
             raise ConfigError(self.TABLE, "mac", self.mac, "another one: this modem does not poll")
         if self.ranging_period_s and not capabilities.ranging:
             raise ConfigError(self.TABLE, "ranging_period_s", self.ranging_period_s, "0: this modem measures no ranges")
-        packet_s = self.rate_info(self.downlink_rate).airtime_s
-        if self.mac == "tdma" and self.slot_s - self.guard_s < packet_s:
-            expected = f"slot_s - guard_s of at least {packet_s} s, a packet of downlink_rate"
-            raise ConfigError(self.TABLE, "slot_s", self.slot_s, expected)
+        self._check_packet(self.rate_info(self.downlink_rate).airtime_s)
 
     @override
     def check_with(self, platform: PlatformConfig) -> None:
@@ -151,9 +139,15 @@ class OpModemConfig(ModemServiceConfig):
         """Whether the vessel sends to vehicles."""
         return self.link == "v1" and self.lead_vessel is None
 
-    def slots(self) -> Tdma:
-        """Return the slots of "tdma"."""
-        return Tdma(self.tdma_cycle_s, self.slot_start_s, self.slot_s, self.guard_s)
+    def new_mac(self) -> MediumAccess:
+        """Return the policy of medium access control; a vessel that polls sends between its polls."""
+        match self.mac:
+            case "csma":
+                return Csma(0.0, holdoff_s=self.holdoff_s)
+            case "tdma":
+                return Tdma(self.tdma_cycle_s, *self.tdma_slot_s)
+            case "polled":
+                return Continuous()
 
     def receiver_config(self) -> ReceiverConfig:
         """Return the configuration of the `v1` receiver."""

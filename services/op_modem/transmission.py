@@ -6,7 +6,6 @@ import logging
 import math
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import Final
 
 from sonarpost import keys
@@ -32,35 +31,32 @@ _PACKET_MARGIN_S = 1.0
 _WAIT_AFTER_FAILURE_S = 2.0
 
 
-@dataclass
 class TransmitGate:
-    """Decides when the vessel may transmit. `now_s` is monotonic time in seconds.
+    """Decides when the vessel may transmit, by its medium access control. `now_s` is monotonic time in seconds.
 
-    Attributes:
+    Modems are half-duplex: each sent packet can cost a received one.
+
+    Args:
         config: Configuration of op_modem.
-        last_frame_s: Time of the last received frame.
-        pending_since_s: Since when a packet is pending, None while none is.
-        not_before_s: End of the wait after the modem failed to send.
-        polled_s: Time of the last poll.
     """
 
-    config: OpModemConfig
-    last_frame_s: float = -math.inf
-    pending_since_s: float | None = None
-    not_before_s: float = -math.inf
-    polled_s: float = -math.inf
-    _next_vehicle: int = field(default=0, repr=False)
+    def __init__(self, config: OpModemConfig) -> None:
+        self._config = config
+        self._mac = config.new_mac()
+        self._pending_since_s: float | None = None
+        self._not_before_s = self._polled_s = -math.inf
+        self._next_vehicle = 0
 
     def frame_received(self, now_s: float) -> None:
         """Record that a frame was received."""
-        self.last_frame_s = now_s
+        self._mac.channel_busy(now_s)
 
     def failed(self, now_s: float) -> None:
         """Record that the modem failed to send."""
-        self.not_before_s = now_s + _WAIT_AFTER_FAILURE_S
+        self._not_before_s = now_s + _WAIT_AFTER_FAILURE_S
 
     def may_transmit(self, now_s: float, utc_s: float, *, receiving: bool, pending: bool) -> bool:
-        """Return whether a packet may be sent now.
+        """Return whether a packet may be sent now; with "csma", `max_defer_s` limits the wait for a free channel.
 
         Args:
             now_s: Monotonic time.
@@ -69,15 +65,14 @@ class TransmitGate:
             pending: Whether a packet is pending.
         """
         if not pending:
-            self.pending_since_s = None
+            self._pending_since_s = None
             return False
-        if self.pending_since_s is None:
-            self.pending_since_s = now_s
-        if receiving or now_s < self.not_before_s:
-            return False
-        if self.config.mac != "csma":
-            return self.is_free(now_s, utc_s, receiving=receiving)
-        return self._is_idle(now_s) or now_s - self.pending_since_s >= self.config.max_defer_s
+        if self._pending_since_s is None:
+            self._pending_since_s = now_s
+        if self.is_free(now_s, utc_s, receiving=receiving):
+            return True
+        is_late = self._config.mac == "csma" and now_s - self._pending_since_s >= self._config.max_defer_s
+        return is_late and not receiving and now_s >= self._not_before_s
 
     def is_free(self, now_s: float, utc_s: float, *, receiving: bool) -> bool:
         """Return whether the vessel may transmit now without a wait that is limited by `max_defer_s`.
@@ -87,25 +82,19 @@ class TransmitGate:
             utc_s: UTC in seconds, for TDMA.
             receiving: Whether a packet is being received.
         """
-        if receiving or now_s < self.not_before_s:
+        if receiving or now_s < self._not_before_s:
             return False
-        if self.config.mac == "tdma":
-            packet_s = self.config.rate_info(self.config.downlink_rate).airtime_s
-            slots = self.config.slots()
-            # The margin covers the start of the modem; a slot that is too short for it is used without.
-            wait_s = slots.wait_s(packet_s + _PACKET_MARGIN_S, utc_s)
-            return (slots.wait_s(packet_s, utc_s) if wait_s is None else wait_s) == 0.0
-        return self.config.mac == "polled" or self._is_idle(now_s)
-
-    def _is_idle(self, now_s: float) -> bool:
-        """Return whether no frame was received for `holdoff_s`."""
-        return now_s - self.last_frame_s >= self.config.holdoff_s
+        time_s = utc_s if self._config.mac == "tdma" else now_s
+        packet_s = self._config.rate_info(self._config.downlink_rate).airtime_s
+        # The margin covers the start of the modem; a slot that is too short for it is used without.
+        wait_s = self._mac.wait_s(packet_s + _PACKET_MARGIN_S, time_s)
+        return (self._mac.wait_s(packet_s, time_s) if wait_s is None else wait_s) == 0.0
 
     def vehicle_to_poll(self, now_s: float, addresses: Sequence[int]) -> int | None:
         """Return the modem address to poll now, None for none."""
-        if self.config.mac != "polled" or not addresses or now_s - self.polled_s < self.config.poll_interval_s:
+        if self._config.mac != "polled" or not addresses or now_s - self._polled_s < self._config.poll_interval_s:
             return None
-        self.polled_s = now_s
+        self._polled_s = now_s
         address = addresses[self._next_vehicle % len(addresses)]
         self._next_vehicle += 1
         return address

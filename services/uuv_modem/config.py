@@ -43,10 +43,6 @@ class UuvModemConfig(ModemServiceConfig):
         rx_window_s: Continuous: length of a receive window, 0 for none. A packet that begins in it is received to its
             end, so it must cover the vessel's `holdoff_s`, the two-way travel time and one second.
         holdoff_s: Continuous, csma: silence of other stations before this one sends.
-        tdma_cycle_s: TDMA: length of the cycle; cycles begin at multiples of it since 1970-01-01 UTC.
-        slot_start_s: TDMA: start of the slot in the cycle.
-        slot_s: TDMA: length of the slot.
-        guard_s: TDMA: time at the end of the slot without transmission.
         mean_backoff_s: CSMA: mean of the random waits.
         stop_on_decision: v1: whether a decision for `mine_like` or `not_mine_like` stops the rest of its image; a later
             decision for `unsure` queues the rest again.
@@ -80,10 +76,6 @@ class UuvModemConfig(ModemServiceConfig):
     tx_burst_s: Seconds = 90.0
     rx_window_s: Annotated[float, Field(ge=0, le=86400)] = 5.0
     holdoff_s: Annotated[float, Field(ge=0, le=600)] = 5.0
-    tdma_cycle_s: Seconds = 60.0
-    slot_start_s: Annotated[float, Field(ge=0, le=86400)] = 0.0
-    slot_s: Seconds = 20.0
-    guard_s: Annotated[float, Field(ge=0, le=86400)] = 1.0
     mean_backoff_s: Annotated[float, Field(ge=0, le=86400)] = 10.0
     queue_interval_s: Annotated[float, Field(ge=0.05, le=3600)] = 5.0
     status_period_s: Annotated[float, Field(ge=0, le=86400)] = 0.0
@@ -93,9 +85,7 @@ class UuvModemConfig(ModemServiceConfig):
     decision_consumers: tuple[ConsumerName, ...] = ()
 
     @model_validator(mode="after")
-    def _slot_fits_the_cycle(self) -> UuvModemConfig:
-        if self.mac == "tdma" and self.slot_start_s + self.slot_s > self.tdma_cycle_s:
-            raise ValueError(f"a slot that ends within tdma_cycle_s = {self.tdma_cycle_s}")
+    def _check_status_period(self) -> UuvModemConfig:
         if 0 < self.status_period_s < MIN_STATUS_PERIOD_S:
             raise ValueError(f"status_period_s of 0 or at least {MIN_STATUS_PERIOD_S:g} s")
         if self.status_period_s and self.link != "v1":
@@ -110,10 +100,7 @@ class UuvModemConfig(ModemServiceConfig):
             self._check_rate("allowed_rates", number)
         if self.mac == "polled" and self.link == "v1" and not capabilities.polling:
             raise ConfigError(self.TABLE, "mac", self.mac, "another one: this modem does not poll")
-        longest_s = max(self.rate_info(number).airtime_s for number in (self.rate, *self.allowed_rates))
-        if self.mac == "tdma" and self.slot_s - self.guard_s < longest_s:
-            expected = f"slot_s - guard_s of at least {longest_s} s, the longest packet"
-            raise ConfigError(self.TABLE, "slot_s", self.slot_s, expected)
+        self._check_packet(max(self.rate_info(number).airtime_s for number in (self.rate, *self.allowed_rates)))
 
     @override
     def check_with(self, platform: PlatformConfig) -> None:
@@ -135,7 +122,7 @@ class UuvModemConfig(ModemServiceConfig):
             case "continuous":
                 return Continuous(self.tx_burst_s, self.rx_window_s, self.holdoff_s)
             case "tdma":
-                return Tdma(self.tdma_cycle_s, self.slot_start_s, self.slot_s, self.guard_s)
+                return Tdma(self.tdma_cycle_s, *self.tdma_slot_s)
             case "polled":
                 return Polled()
             case "csma":

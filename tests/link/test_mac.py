@@ -42,8 +42,8 @@ def test_continuous_without_pauses_waits_only_for_other_stations():
 
 
 @given(now=TIMES, packet_s=st.floats(0.5, 9.0), start_s=st.floats(0, 40.0))
-def test_tdma_packet_ends_before_the_guard_time(now, packet_s, start_s):
-    mac = Tdma(60.0, start_s, 12.0, 2.0)
+def test_tdma_packet_ends_within_its_slot(now, packet_s, start_s):
+    mac = Tdma(60.0, start_s, start_s + 10.0)
     wait_s = mac.wait_s(packet_s, now)
     assert wait_s is not None
     assert 0 <= wait_s <= 60.0
@@ -58,7 +58,7 @@ def test_tdma_stations_never_collide(now, packet_s, stations):
     slot_s, travel_s = 8.0, 1.0
     sent = []
     for n in range(stations):
-        mac = Tdma(stations * slot_s, n * slot_s, slot_s, 2.0)
+        mac = Tdma(stations * slot_s, n * slot_s, (n + 1) * slot_s - 2.0)
         start = now + (mac.wait_s(packet_s, now) or 0.0)
         sent.append((start, start + packet_s + travel_s))
     sent.sort()
@@ -66,7 +66,7 @@ def test_tdma_stations_never_collide(now, packet_s, stations):
 
 
 def test_tdma_slot_too_short_for_the_packet_returns_none():
-    assert Tdma(60.0, 0.0, 5.0, 1.0).wait_s(6.0, 0.0) is None
+    assert Tdma(60.0, 0.0, 4.0).wait_s(6.0, 0.0) is None
 
 
 def test_polled_station_never_starts():
@@ -101,8 +101,8 @@ def test_csma_defers_to_others_and_tolerates_a_clock_set_back():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: Tdma(10.0, 5.0, 6.0, 0.0),
-        lambda: Tdma(10.0, 0.0, 5.0, 6.0),
+        lambda: Tdma(10.0, 5.0, 11.0),
+        lambda: Tdma(10.0, 6.0, 5.0),
         lambda: Continuous(0.0, 1.0),
         lambda: Continuous(1.0, -1.0),
         lambda: Csma(-1.0),

@@ -100,33 +100,31 @@ class Continuous(MediumAccess):
 class Tdma(MediumAccess):
     """Sends in its own slot of a cycle (time-division multiple access), so that stations never collide.
 
-    Cycles repeat from 1970-01-01 UTC on. The last `guard_s` of a slot are silent: they cover the difference between
+    Cycles repeat from 1970-01-01 UTC on. The time between the slots of two stations covers the difference between their
     clocks and the acoustic travel time.
 
     Args:
         tdma_cycle_s: Length of the cycle.
-        slot_start_s: Start of the slot in the cycle.
-        slot_s: Length of the slot, which lies within the cycle.
-        guard_s: Silent time at the end of the slot, shorter than the slot.
+        start_s: Start of the slot in the cycle.
+        end_s: End of the slot in the cycle.
     """
 
-    def __init__(self, tdma_cycle_s: float, slot_start_s: float, slot_s: float, guard_s: float) -> None:
+    def __init__(self, tdma_cycle_s: float, start_s: float, end_s: float) -> None:
         super().__init__()
         _check("tdma_cycle_s", tdma_cycle_s, 0.001, 86400)
-        _check("slot_start_s", slot_start_s, 0, tdma_cycle_s)
-        _check("slot_s", slot_s, 0.001, tdma_cycle_s - slot_start_s)
-        _check("guard_s", guard_s, 0, slot_s)
+        _check("tdma_slot_s", end_s, 0.001, tdma_cycle_s)
+        _check("tdma_slot_s", start_s, 0, end_s)
         self._cycle_s = tdma_cycle_s
-        self._start_s = slot_start_s
-        self._usable_s = slot_s - guard_s
+        self._start_s = start_s
+        self._slot_s = end_s - start_s
 
     @override
     def wait_s(self, packet_s: float, now: float) -> float | None:
         """Return the time to a slot with room for the packet, None if no slot is long enough."""
-        if packet_s > self._usable_s:
+        if packet_s > self._slot_s:
             return None
         elapsed_s = (now - self._start_s) % self._cycle_s
-        return 0.0 if elapsed_s + packet_s <= self._usable_s else self._cycle_s - elapsed_s
+        return 0.0 if elapsed_s + packet_s <= self._slot_s else self._cycle_s - elapsed_s
 
 
 class Polled(MediumAccess):

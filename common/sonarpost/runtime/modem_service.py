@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable
 from typing import Annotated, ClassVar, Self, TypeVar
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field, PrivateAttr, model_validator
 from typing_extensions import override
 
 from sonarpost.config import PlatformConfig, ServiceConfig
@@ -35,6 +35,11 @@ class ModemServiceConfig(ServiceConfig):
         address: The modem's own address, set at start-up.
         reply_timeout_s: Time to wait for the modem's reply before a command is sent again.
         max_carrier_sense_s: Longest time for which a busy channel delays a packet; some times the longest packet.
+        mac: Medium access control.
+        holdoff_s: Time without a packet of this station after a frame of another one.
+        tdma_cycle_s: TDMA: length of the cycle of slots; cycles begin at multiples of it since 1970-01-01 UTC.
+        tdma_slot_s: TDMA: start and end of this station's slot in the cycle. Leave time between the slots of two
+            stations for the travel time and the difference between clocks.
     """
 
     TABLE: ClassVar[str] = ""
@@ -49,7 +54,18 @@ class ModemServiceConfig(ServiceConfig):
     address: Address
     reply_timeout_s: Annotated[float, Field(gt=0, le=600)] = 5.0
     max_carrier_sense_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
+    mac: str = "csma"
+    holdoff_s: Annotated[float, Field(ge=0, le=86400)] = 5.0
+    tdma_cycle_s: Seconds = 60.0
+    tdma_slot_s: tuple[Annotated[float, Field(ge=0)], float] = (0.0, 19.0)
     _capabilities: ModemCapabilities | None = PrivateAttr(default=None)
+
+    @model_validator(mode="after")
+    def _check_slot(self) -> Self:
+        start_s, end_s = self.tdma_slot_s
+        if self.mac == "tdma" and not start_s < end_s <= self.tdma_cycle_s:
+            raise ValueError(f"a tdma_slot_s that ends after its start and within tdma_cycle_s = {self.tdma_cycle_s}")
+        return self
 
     @override
     def check_with(self, platform: PlatformConfig) -> None:
@@ -108,6 +124,13 @@ class ModemServiceConfig(ServiceConfig):
         for name in (*self.UPLINK_RATES, *self.DOWNLINK_RATES):
             self._check_rate(name, getattr(self, name))
         self._check_address("address", self.address)
+
+    def _check_packet(self, packet_s: float) -> None:
+        """Check that a packet of a length fits the slot."""
+        start_s, end_s = self.tdma_slot_s
+        if self.mac == "tdma" and end_s - start_s < packet_s:
+            expected = f"a slot of at least {packet_s} s, the longest packet"
+            raise ConfigError(self.TABLE, "tdma_slot_s", self.tdma_slot_s, expected)
 
     def _check_rate(self, name: str, rate: int) -> None:
         if rate not in self.capabilities.rates:

@@ -422,7 +422,7 @@ def test_csma_sends_after_the_holdoff_or_the_maximum_wait():
 
 
 def test_tdma_sends_in_its_slot_only():
-    mine = gate(mac="tdma", tdma_cycle_s=60.0, slot_start_s=50.0, slot_s=10.0, guard_s=1.0)
+    mine = gate(mac="tdma", tdma_cycle_s=60.0, tdma_slot_s=(50.0, 59.0))
     sent = [at for at in range(120) if mine.may_transmit(float(at), float(at), receiving=False, pending=True)]
     assert sent == [50, 51, 52, 53, 54, 110, 111, 112, 113, 114]
 
@@ -439,8 +439,8 @@ def test_vehicles_are_polled_in_turn():
     [
         {"vehicles": {"3": "uuv-1", "4": "uuv-1"}},
         {"vehicles": {"300": "uuv-1"}},
-        {"mac": "tdma", "slot_start_s": 55.0},
-        {"mac": "tdma", "slot_start_s": 0.0, "slot_s": 3.0},
+        {"mac": "tdma", "tdma_slot_s": (50.0, 61.0)},
+        {"mac": "tdma", "tdma_slot_s": (0.0, 2.0)},
         {"vehicles": {"200": "uuv-1"}},
         {"downlink_rate": 9},
         {"address": 128},

@@ -360,7 +360,7 @@ def test_unreadable_parts_of_the_state_are_quarantined_and_the_rest_is_sent(
 
 
 @pytest.mark.parametrize(
-    "slot", [{"tdma_cycle_s": 10.0, "slot_s": 20.0}, {"slot_s": 6.0}, {"slot_s": 20.0, "slot_start_s": 50.0}]
+    "slot", [{"tdma_cycle_s": 10.0}, *({"tdma_slot_s": slot} for slot in ((0.0, 5.0), (50.0, 70.0), (9.0, 1.0)))]
 )
 def test_slot_without_space_for_a_packet_is_a_configuration_error(slot):
     with pytest.raises((ValueError, ConfigError), match="slot"):
