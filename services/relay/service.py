@@ -269,14 +269,14 @@ class RelayService(Service[RelayConfig]):
             tx.add_state(name, item.payload)  # a stored one is the same version or a later one
             self._prune_versions(tx, item.queue)
             return False
-        known = image_parts.stored_version(tx.get_state(name), name)
+        known = image_parts.stored_number(tx.get_state(name))
         whole = self._take_whole(tx, item, part) if part.base else item.payload
         if whole is None:
             # Deleted for a later version that the site has, or for newer images.
             log.warning("Image version not stored: its whole image was deleted", extra=kv(state=name))
-            return reason is not None and known is not None and known.n > part.version
+            return reason is not None and known > part.version
         if reason is None:
-            if known is None or known.n < part.version:
+            if known < part.version:
                 tx.put_state(name, whole)
                 self._prune_versions(tx, item.queue)
             return False

@@ -259,6 +259,14 @@ def stored_version(value: bytes | None, name: str) -> ImagePart | None:
         return None
 
 
+def stored_number(value: bytes | None) -> int:
+    """Return the number of a version that a store keeps; 0 for none, or if it cannot be read."""
+    try:
+        return 0 if value is None else head_of(value).version
+    except (ValueError, TypeError, LookupError):
+        return 0
+
+
 def surplus_names(names: Sequence[str]) -> Sequence[str]:
     """Return those names of stored versions that are beyond `MAX_VERSIONS`, the oldest images."""
     by_time = sorted(names, key=lambda name: float(name.rpartition("/")[2]))
