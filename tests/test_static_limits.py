@@ -124,7 +124,6 @@ CALLERS = ("services/", *packages("archive", "cli", "delivery", "extensions", "m
 MAPPED = "its caller `main` reports it"
 RAISES = {
     "common/sonarpost/cli/c2/migrate.py: Migration._stored_images: read_image_files": "a folder, not a database",
-    "common/sonarpost/cli/dataset.py: _load: load_labelled_image": "the states of the contacts were selected before",
     "common/sonarpost/cli/pki.py: run_acoustic: create_key": MAPPED,
     "common/sonarpost/cli/pki.py: run_router_config: write_new": MAPPED,
     "services/atd_stub/service.py: AtdStubService._process: _content_of": "its caller tries the file again",

@@ -5,7 +5,6 @@ import json
 
 import pytest
 from builders.records import decision_record, reconstructed_image
-from PIL import Image
 
 from sonarpost.archive.journal import Criteria, Journal
 from sonarpost.archive.shore_database import ShoreDatabase
@@ -195,14 +194,6 @@ def test_files_of_an_image_are_copied_from_the_database(places, tmp_path):
     assert len(copies[0]) == 3
     [side_car] = [json.loads(data) for name, data in copies[1].items() if name.endswith(".json")]
     assert side_car["version"] == 2
-
-
-def test_data_set_is_written_from_the_database(places, tmp_path, capsys):
-    out = tmp_path / "dataset"
-    assert main(["dataset", "export", *places[1], "--out", str(out)]) == 1  # the conflict
-    [labelled, _] = sorted(out.rglob("*.png"))
-    with Image.open(labelled) as opened:
-        assert opened.size == (30, 20)
 
 
 def test_console_reads_the_records_of_the_database(places, tmp_path, database_url):

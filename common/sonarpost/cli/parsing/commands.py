@@ -52,7 +52,6 @@ COMMANDS: Final[Mapping[str, CommandSpec]] = {
     "c2": CommandSpec(
         "list, export and watch the contacts of a shore site; send commands", "sonarpost.cli.c2:add_actions"
     ),
-    "dataset": CommandSpec("training data from the verdicts of operators", "sonarpost.cli.dataset:add_actions"),
     "store": CommandSpec(
         "check the store of a stopped service, and recover a damaged one", "sonarpost.cli.store:add_actions"
     ),

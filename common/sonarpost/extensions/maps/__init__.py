@@ -1,4 +1,4 @@
-"""Maps of whole recordings: mosaic of the seabed as GeoTIFF, covered seabed as polygons."""
+"""Maps of whole recordings: mosaic and waterfalls of the seabed as GeoTIFF, covered seabed as polygons."""
 
 from __future__ import annotations
 
@@ -15,4 +15,9 @@ COVERAGE: Final = CommandSpec(
     "write the covered seabed as polygons",
     "sonarpost.extensions.maps.command:add_coverage",
     "line.xtf --out coverage.gpkg",
+)
+WATERFALL: Final = CommandSpec(
+    "write the waterfall of each straight line as cloud-optimised GeoTIFF",
+    "sonarpost.extensions.maps.command:add_waterfall",
+    "line.xtf --out waterfalls",
 )

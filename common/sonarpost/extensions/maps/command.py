@@ -1,4 +1,4 @@
-"""`sonarpost survey coverage` and `mosaic`: the covered seabed as polygons, a mosaic of it as GeoTIFF."""
+"""`sonarpost survey coverage`, `mosaic` and `waterfall`: covered seabed as polygons, images of it as GeoTIFF."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Final
 
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.cli.shared import add_survey_options, in_new_folder, option, survey_options_of
-from sonarpost.cli.survey.waterfall import check_resolution
+from sonarpost.cli.shared import add_survey_options, in_new_folder, make_output_folder, option, survey_options_of
 from sonarpost.errors import ConfigError
 from sonarpost.extensions.maps.coverage import (
     CoveragePolygon,
@@ -19,6 +18,8 @@ from sonarpost.extensions.maps.coverage import (
     write_coverage_geopackage,
 )
 from sonarpost.extensions.maps.mosaic import write_mosaic
+from sonarpost.extensions.maps.waterfall import write_waterfalls
+from sonarpost.sonar.maps.ground_canvas import MIN_RESOLUTION_M
 
 WRITERS: Final[Mapping[str, Callable[[Path, Sequence[CoveragePolygon]], None]]] = {
     ".gpkg": write_coverage_geopackage,
@@ -107,3 +108,48 @@ def run_mosaic(parsed: argparse.Namespace) -> int:
     )
     print_left_out(result.coverage.left_out)
     return 0
+
+
+def add_waterfall(parser: CommandParser) -> None:
+    """Add the options of `survey waterfall`."""
+    parser.description = (
+        "Write LINE-waterfall-N.tif for each straight line of every survey file: over ground, along-track upwards, "
+        "port on the left."
+    )
+    option(parser, "files FILE", "survey file", Path, nargs="+")
+    option(parser, "--out DIR", "output folder", Path, Path())
+    option(parser, "--resolution-m M", "side of a pixel in metres", float, 0.1)
+    add_survey_options(parser)
+    parser.set_defaults(run=run_waterfall)
+
+
+def run_waterfall(parsed: argparse.Namespace) -> int:
+    """Write the waterfalls of every file and print their names; return 0.
+
+    Raises:
+        ConfigError: The resolution is out of range.
+        SurveyFileError: A recording cannot be read or positioned, or has no straight line.
+    """
+    check_resolution(parsed.resolution_m, "survey waterfall")
+    options = survey_options_of(parsed)
+    make_output_folder(parsed.out)
+    for path in parsed.files:
+        with ProgressDisplay(step=f"drawing {path}"):
+            waterfalls = write_waterfalls(path, parsed.out, parsed.resolution_m, options)
+        for waterfall in waterfalls:
+            height_px, width_px = waterfall.size_px
+            print(
+                f"{waterfall.path}: {width_px} x {height_px} px of {parsed.resolution_m:g} m, "
+                f"EPSG:{waterfall.transform.epsg}, pings {waterfall.first_ping} to {waterfall.last_ping}"
+            )
+    return 0
+
+
+def check_resolution(resolution_m: float, command: str) -> None:
+    """Check --resolution-m.
+
+    Raises:
+        ConfigError: It is out of range.
+    """
+    if not MIN_RESOLUTION_M <= resolution_m <= 1000:  # includes NaN
+        raise ConfigError(command, "--resolution-m", resolution_m, f"{MIN_RESOLUTION_M} to 1000 metres")

@@ -16,7 +16,8 @@ from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import flag, make_output_folder, option, print_rejected
 from sonarpost.errors import BadInputError
-from sonarpost.export.coco import (
+from sonarpost.export.contacts import ExportContact, load_contacts
+from sonarpost.extensions.dataset.coco import (
     ANNOTATIONS_FILE,
     IMAGES_FOLDER,
     LabelledImage,
@@ -26,7 +27,6 @@ from sonarpost.export.coco import (
     label_state,
     load_labelled_image,
 )
-from sonarpost.export.contacts import ExportContact, load_contacts
 from sonarpost.files import write_atomically
 from sonarpost.sonar.image_files import write_png
 
