@@ -55,7 +55,7 @@ class Connected:
         # The port is not opened: the service has an open one and the driver of the simulated modem instead.
         service.modem._port = SimpleNamespace(is_open=True, error="")
         service.modem._driver = self.modem.driver
-        self.modem.driver.start(0.0)
+        self.modem.driver.port_opened(0.0)
         self.run(5.0)
 
     def run(self, seconds):
