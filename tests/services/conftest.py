@@ -1,7 +1,5 @@
 """Fixtures of these tests; `builders.services` makes them."""
 
-from __future__ import annotations
-
 from builders.services import (
     check_monitoring,
     full_disk,

@@ -1,7 +1,5 @@
 """Every service reports its health before it has reached a router."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 

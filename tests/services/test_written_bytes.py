@@ -1,7 +1,5 @@
 """Bytes that a service writes into its store for each frame or image: they do not grow with the number of contacts."""
 
-from __future__ import annotations
-
 import sqlite3
 
 import pytest

@@ -4,30 +4,6 @@ import pytest
 from builders.queue_exchange import Exchange, all_delivered
 
 
-def test_images_sent_without_feedback_are_completed_with_feedback() -> None:
-    exchange = Exchange()
-    for number in range(1, 25):
-        exchange.add(number)
-        exchange.run(300.0, feedback=False)
-    assert len(exchange.shown) == 24
-    assert len(exchange.complete) < 24
-    exchange.run(3 * 3600.0, feedback=True)
-    assert len(exchange.complete) == 24
-    assert all_delivered(exchange)
-
-
-def test_images_sent_before_contact_are_completed_with_feedback() -> None:
-    exchange = Exchange()
-    for number in range(1, 41):
-        exchange.add(number)
-        exchange.run(200.0, feedback=False, reception=False)
-    assert not exchange.shown
-    exchange.add(41)
-    exchange.run(4 * 3600.0, feedback=True)
-    assert len(exchange.complete) == 41
-    assert all_delivered(exchange)
-
-
 def test_delivered_images_and_received_parts_of_retired_blocks_are_not_sent_again() -> None:
     exchange = Exchange(loss=0.0)
     for number in range(1, 8):

@@ -1,7 +1,5 @@
 """Huffman codec: code, choice of levels, budgets, truncation, damage."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

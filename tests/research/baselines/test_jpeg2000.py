@@ -1,7 +1,5 @@
 """JPEG 2000: omitted headers, budgets, golden streams, damage, no output of the library."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Quality of the baseline codecs on real snippets."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """SPIHT: transform, trees, embedded stream, passes, damage and quality."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from builders.common import GOLDEN_FOLDER

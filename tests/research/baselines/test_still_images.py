@@ -1,7 +1,5 @@
 """JPEG XL, AVIF and WebP: budgets, golden streams, omitted headers, sizes, damage, missing libraries."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

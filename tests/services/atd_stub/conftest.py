@@ -1,7 +1,5 @@
 """Fixtures of these tests: the service with short delays, its folder and its consumer."""
 
-from __future__ import annotations
-
 import pytest
 from builders.joined_surveys import FEW_CANDIDATES
 

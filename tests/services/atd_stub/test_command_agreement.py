@@ -1,7 +1,5 @@
 """`sonarpost detect` and the vehicle give the same contacts for the same files."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """atd_stub at file boundaries: an object across two files is one contact, and no held contact is lost."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """atd_stub: an entry of its folder that cannot be read is reported and does not affect the others."""
 
-from __future__ import annotations
-
 import os
 import socket
 from dataclasses import replace

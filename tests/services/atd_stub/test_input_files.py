@@ -1,7 +1,5 @@
 """atd_stub: each file is processed once, bad files are quarantined with a reason, polling continues."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

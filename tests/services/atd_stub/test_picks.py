@@ -1,7 +1,5 @@
 """atd_stub: contacts of the picks beside a survey are sent once, and before the others that wait."""
 
-from __future__ import annotations
-
 from builders.common import eventually
 
 from sonarpost import wire

@@ -1,7 +1,5 @@
 """A recorded layback that is not applied: the contact record, the health and the next file of the line say so."""
 
-from __future__ import annotations
-
 import math
 import struct
 

@@ -1,7 +1,5 @@
 """atd_stub: release of contacts by the credit of the acoustic transmit queue."""
 
-from __future__ import annotations
-
 import os
 import random
 import subprocess

@@ -1,7 +1,5 @@
 """atd_stub: retention of input files, of their entries and of stored snippets."""
 
-from __future__ import annotations
-
 import os
 import time
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Difficulty of the seabed in the health of atd_stub."""
 
-from __future__ import annotations
-
 import pytest
 from builders.common import eventually
 from builders.joined_surveys import Box, split, survey_of

@@ -1,7 +1,5 @@
 """atd_stub: recordings of several files are processed, deduplicated, quarantined and removed as one."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

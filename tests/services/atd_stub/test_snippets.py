@@ -1,7 +1,5 @@
 """The records of atd_stub: position with its error, measured heights, images, and the text files beside them."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """atd_stub: masking of pings during the transmissions of the vehicle's own modem."""
 
-from __future__ import annotations
-
 import logging
 import time
 from dataclasses import replace

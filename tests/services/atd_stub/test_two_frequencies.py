@@ -1,7 +1,5 @@
 """atd_stub with dual-frequency sonars: files are joined, and contacts equal those of the first frequency alone."""
 
-from __future__ import annotations
-
 import pytest
 from builders.joined_surveys import FEW_CANDIDATES, RANGE_M, SAMPLES, Box, detect_in_files, near, split, survey_of
 from builders.two_frequencies import with_second_frequency

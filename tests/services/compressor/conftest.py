@@ -1,7 +1,5 @@
 """Fixtures of the compressor tests: the service, its neighbours in the chain, and codecs to compare with."""
 
-from __future__ import annotations
-
 from itertools import count
 
 import pytest

@@ -1,7 +1,5 @@
 """compressor: the commands resend, refine and region."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import msgpack

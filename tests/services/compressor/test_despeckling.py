@@ -1,7 +1,5 @@
 """compressor: despeckling, and the command `original`, which sends the image without it as an image of its own."""
 
-from __future__ import annotations
-
 import pytest
 from builders.common import eventually
 

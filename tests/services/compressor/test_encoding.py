@@ -1,7 +1,5 @@
 """compressor: one stream a snippet, unique identifiers, bad snippets quarantined."""
 
-from __future__ import annotations
-
 import msgpack
 import numpy as np
 import pytest

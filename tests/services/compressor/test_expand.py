@@ -1,7 +1,5 @@
 """compressor: the expand command (kind "expand") sends more seabed around a contact as an image of its own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from builders.common import eventually

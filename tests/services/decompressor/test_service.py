@@ -1,7 +1,5 @@
 """decompressor: decodes received images, marks missing pixels, writes files that agree with the record."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -47,16 +47,6 @@ def test_broadcast_at_30_percent_loss_delivers_contacts_and_most_images(frame_by
         assert sum(e.complete for e in world.latest.values()) >= 24
 
 
-def test_previews_precede_detail() -> None:
-    sender = V1Sender(SenderConfig())
-    for number in range(1, 25):
-        sender.add_image(number, contact(number), stream(number, 500), 0.0)
-    kinds = [parse_frame(frame) for _ in range(30) if (frame := sender.next_frame(0.0))]
-    first = [k.kind for k in kinds if isinstance(k, Symbol)]
-    assert set(first[:24]) == {SymbolKind.PREVIEW}
-    assert SymbolKind.OBJECT in first[24:]
-
-
 def test_receivers_with_different_loss_get_different_layers() -> None:
     channels = (LossChannel(0.05), LossChannel(0.6))
     config = SenderConfig(channels=channels, frames_per_image=9.0)
