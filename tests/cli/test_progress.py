@@ -81,8 +81,6 @@ def line(tmp_path_factory):
         ("survey info {line} --json", "reading {line}: "),
         ("detect {line} --json", "detecting in {line}: 0 of 1, "),
         ("survey plot {line} --out {folder}", "drawing {line}: "),
-        ("survey export {line} --out {folder}/track.csv", "reading {line}: "),
-        ("simulate {folder}/other.xtf --pings 60 --samples 256 --targets 0 --clutter 0", "simulating 60 pings: "),
     ],
 )
 def test_long_commands_have_progress_and_quiet_removes_it(words, expected, line, tmp_path, capsys, monkeypatch):

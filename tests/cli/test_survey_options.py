@@ -109,8 +109,7 @@ def test_keys_of_the_vehicle_can_be_in_a_file_or_in_the_table(options, tmp_path)
 
 @pytest.mark.parametrize(
     ("command", "given", "message"),
-    [("detect", *each) for each in WRONG]
-    + [(name, *WRONG[0]) for name in ("survey info", "survey plot", "survey export", "run")],
+    [("detect", *each) for each in WRONG] + [(name, *WRONG[0]) for name in ("survey info", "survey plot", "run")],
 )
 def test_wrong_options_are_one_line_before_any_work(command, given, message, tmp_path, config, capsys):
     (tmp_path / "a.xtf").write_bytes(b"not read before the options are valid")

@@ -1,8 +1,6 @@
 """`sonarpost survey` with surveys of known content."""
 
-import csv
 import dataclasses
-import io
 import json
 
 import numpy as np
@@ -38,58 +36,6 @@ def test_info_states_content_track_length_and_warnings(small_survey, tmp_path, c
     assert "pings                101" in text
     assert "track_m              198" in text  # positions are summed in steps of at least 5 m: 6 m here
     assert "note: no position fix in 1 of 101 pings, the first in row 50" in text
-
-
-def test_export_csv(small_survey, tmp_path, capsys):
-    survey = small_survey()
-    without_fix = dataclasses.replace(survey.pings[2], lat_deg=None, lon_deg=None)
-    path = make_xtf(dataclasses.replace(survey, pings=(*survey.pings[:2], without_fix, *survey.pings[3:])), tmp_path)
-    assert main(["survey", "export", str(path)]) == 0
-    lines = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
-    assert [float(line["number"]) for line in lines] == [10, 11, 12, 13, 14]
-    assert lines[2]["lat_deg"] == ""
-    assert float(lines[3]["lat_deg"]) == pytest.approx(survey.pings[3].lat_deg, abs=1e-8)
-    assert lines[0]["time_utc"] == "2013-09-10T21:13:08.130Z"
-
-
-def test_export_geojson_divides_the_track_at_gaps_and_the_180th_meridian(small_survey, tmp_path):
-    start = small_survey().pings[0]
-    fixes = [(0, 179.9995), (1, 179.9999), (2, -179.9998), (3, -179.9994), (200, -179.9990)]
-    pings = tuple(
-        dataclasses.replace(start, number=n, time_utc_s=start.time_utc_s + s, lon_deg=lon)
-        for n, (s, lon) in enumerate(fixes)
-    )
-    path = make_xtf(dataclasses.replace(small_survey(), pings=pings), tmp_path)
-    out = tmp_path / "track.geojson"
-    assert main(["survey", "export", "--format", "geojson", "--out", str(out), str(path)]) == 0
-    features = json.loads(out.read_text())["features"]
-    assert [f["geometry"]["type"] for f in features] == ["MultiLineString", "Point"]
-    lons = [[179.9995, 179.9999, 180.0], [-180.0, -179.9998, -179.9994]]
-    assert features[0]["geometry"]["coordinates"] == [[[lon, 48.44545] for lon in part] for part in lons]
-    assert [f["properties"]["first_ping"] for f in features] == [0, 4]
-
-
-@pytest.mark.parametrize("kind", ["csv", "geojson"])
-def test_export_without_positions_is_an_error_and_writes_no_file(kind, small_survey, tmp_path, capsys):
-    without = make_xtf(with_values(small_survey(), lat_deg=None, lon_deg=None), tmp_path)
-    write_xtf(small_survey(), tmp_path / "metres.xtf", "EPSG:32619")
-    out = tmp_path / "absent" / "track"
-    for path, crs, message in (
-        (without, [], "positions: got 'none in 5 pings', expected a recording with positions"),
-        (tmp_path / "metres.xtf", [], "got 'projected coordinates', expected their projection, --crs EPSG:N"),
-    ):
-        assert main(["survey", "export", "--format", kind, "--out", str(out), str(path), *crs]) == 2
-        printed = capsys.readouterr()
-        [line] = printed.err.splitlines()
-        assert message in line
-        assert not out.parent.exists()
-        assert main(["survey", "export", "--format", kind, str(path), *crs]) == 2
-        assert capsys.readouterr().out == ""
-    metres = str(tmp_path / "metres.xtf")
-    assert main(["survey", "export", "--format", kind, "--out", str(out), metres, "--crs", "EPSG:32619"]) == 0
-    assert "48.4454" in out.read_text()
-    assert main(["survey", "plot", "--out", str(tmp_path / "plots" / "new"), str(without)]) == 0
-    assert len(list((tmp_path / "plots" / "new").iterdir())) == 2
 
 
 def info_of(path, capsys, *options):
@@ -155,22 +101,19 @@ def test_info_says_that_degrees_are_marked_as_metres(small_survey, tmp_path, cap
     assert info_of(path, capsys)[0]["hints"] == []
 
 
-def test_file_cut_by_a_power_failure_is_read_and_a_damaged_one_leaves_no_export(small_survey, tmp_path, capsys):
+def test_file_cut_by_a_power_failure_is_read_and_a_damaged_one_is_an_error(small_survey, tmp_path, capsys):
     path = make_xtf(small_survey(pings=30, samples=300), tmp_path)
     complete = path.read_bytes()
     path.write_bytes(complete[:-658])
-    for command in (["info", "--json"], ["export"], ["plot", "--out", str(tmp_path)]):
+    for command in (["info", "--json"], ["plot", "--out", str(tmp_path)]):
         assert main(["survey", *command, str(path)]) == 0
         printed = capsys.readouterr()
-        if "export" in command:
-            assert printed.out.count("\n") == 30
-        elif "info" in command:
+        if "info" in command:
             assert json.loads(printed.out)["pings"] == 29
         assert "the file ends inside its last packet" in printed.out + printed.err
     path.write_bytes(complete[:1024] + bytes(512))
-    assert main(["survey", "export", "--out", str(tmp_path / "t.csv"), str(path)]) == 2
+    assert main(["survey", "info", str(path)]) == 2
     assert "marker: got '0000', expected cefa" in capsys.readouterr().err
-    assert not (tmp_path / "t.csv").exists()
 
 
 def test_plot_writes_waterfall_and_track_and_refuses_invalid_arguments(small_survey, tmp_path, capsys):

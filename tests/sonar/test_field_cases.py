@@ -151,5 +151,3 @@ def test_track_across_180_degrees_is_short(surveys, capsys, tmp_path):
     assert main(["survey", "info", str(path), "--json"]) == 0
     west, east = json.loads(capsys.readouterr().out)["lon_deg"]
     assert west > 179.9 > -179.9 > east
-    assert main(["survey", "export", str(path), "--format", "geojson"]) == 0
-    assert '"MultiLineString"' in capsys.readouterr().out

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from sonarpost.cli.parsing.parser import CommandParser
-from sonarpost.cli.survey import export, info, plot
+from sonarpost.cli.survey import info, plot
 
 
 def add_actions(parser: CommandParser) -> None:
     """Add the actions."""
-    for module in (info, plot, export):
+    for module in (info, plot):
         module.add_actions(parser)

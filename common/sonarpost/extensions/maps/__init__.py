@@ -21,3 +21,8 @@ WATERFALL: Final = CommandSpec(
     "sonarpost.extensions.maps.command:add_waterfall",
     "line.xtf --out waterfalls",
 )
+EXPORT: Final = CommandSpec(
+    "write the track of a recording as CSV or GeoJSON",
+    "sonarpost.extensions.maps.track_export:add_options",
+    "line.xtf --format geojson --out track.geojson",
+)

@@ -38,18 +38,13 @@ _FIELDS = (
 )
 
 
-def add_actions(parser: CommandParser) -> None:
-    """Add the action."""
-    parser = parser.add_action(
-        "export",
-        "write the track of a recording as CSV or GeoJSON",
-        run,
-        "line.xtf --format geojson --out track.geojson",
-    )
+def add_options(parser: CommandParser) -> None:
+    """Add the options of `survey export`."""
     option(parser, "file FILE", "survey file", Path)
     option(parser, "--format", "output format", default="csv", choices=("csv", "geojson"))
     option(parser, "--out FILE", "output file (default: standard output)", Path)
     add_survey_options(parser)
+    parser.set_defaults(run=run)
 
 
 def run(parsed: argparse.Namespace) -> int:
