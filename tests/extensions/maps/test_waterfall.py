@@ -12,9 +12,9 @@ from builders.surveys import make_xtf
 
 from sonarpost.cli.main import main
 from sonarpost.errors import SurveyFileError
+from sonarpost.extensions.maps import ground_canvas, track
 from sonarpost.extensions.maps.waterfall import write_waterfalls
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.sonar.maps import ground_canvas, track
 from sonarpost.sonar.survey import Side
 
 

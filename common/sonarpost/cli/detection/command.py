@@ -10,10 +10,11 @@ import dataclasses
 import hashlib
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -39,7 +40,6 @@ from sonarpost.cli.shared import (
     survey_options_of,
 )
 from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
-from sonarpost.detection.contact_map import ContactMap, contact_map
 from sonarpost.detection.detector import MINE_LIKE, Detection, counts_text
 from sonarpost.detection.difficulty import Difficulty, combined
 from sonarpost.detection.picks import PICKED, LocatedPick, PickedDetection
@@ -51,8 +51,8 @@ from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.files import write_atomically
 from sonarpost.messages import Contact
+from sonarpost.registry import Registry
 from sonarpost.sonar.image_files import encode_png, write_png
-from sonarpost.sonar.maps.geotiff import write_image
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.side_car import write_side_car
@@ -69,6 +69,22 @@ _HEADER = (
 _GROUND_PX = 100
 _GROUND_PIXEL_M = 0.1
 _MAP_SIDE_M = 20
+
+
+class WritableMap(Protocol):
+    """Georeferenced image of the seabed around a contact."""
+
+    def write(self, path: Path) -> None:
+        """Write it as GeoTIFF."""
+
+
+DrawSeabed = Callable[[Survey, Detection, float, float], WritableMap | None]
+"""Draws the seabed around a contact: pings, contact, side and pixel in metres. None if its place is not known."""
+
+
+def contact_maps() -> Registry[DrawSeabed]:
+    """Return what draws the seabed around a contact, by the option of `sonarpost detect` that asks for it."""
+    return Registry("sonarpost.contact_maps", "a function", lambda found, _: callable(found), {})
 
 
 def add_options(parser: CommandParser) -> None:
@@ -128,8 +144,8 @@ def run(parsed: argparse.Namespace) -> int:
             options,
             parsed.vehicle,
             transmissions,
+            contact_maps().get("geotiff") if parsed.geotiff else None,
             with_images=parsed.snippets is not None,
-            with_maps=parsed.geotiff,
         )
         results = detection.run(files, display)
         if picks:
@@ -187,7 +203,7 @@ class ListedContact:
     record: Contact
     image: npt.NDArray[np.uint8] | None = None
     ground: npt.NDArray[np.uint8] | None = None
-    seabed: ContactMap | None = None
+    seabed: WritableMap | None = None
     is_picked: bool = False
 
 
@@ -217,15 +233,15 @@ class _Detection:
         options: SurveyOptions,
         vehicle_id: str,
         transmissions: TransmitIntervals,
+        draw_seabed: DrawSeabed | None,
         *,
         with_images: bool,
-        with_maps: bool,
     ) -> None:
         self._settings = settings
         self._options = options
         self._transmissions = transmissions
         self._vehicle_id = vehicle_id
-        self._with_images, self._with_maps = with_images, with_maps
+        self._draw_seabed, self._with_images = draw_seabed, with_images
         self._detector = StreamDetector(self._describe, settings)
         self._results: list[FileListing] = []
 
@@ -286,7 +302,9 @@ class _Detection:
             return ListedContact(in_file, record)
         image = cut_snippet(survey, detection).image
         ground = ground_projected_image(survey, detection, _GROUND_PX, _GROUND_PX, _GROUND_PIXEL_M)
-        seabed = contact_map(survey, detection, _MAP_SIDE_M, _GROUND_PIXEL_M) if self._with_maps else None
+        seabed = None
+        if self._draw_seabed is not None:
+            seabed = self._draw_seabed(survey, detection, _MAP_SIDE_M, _GROUND_PIXEL_M)
         return ListedContact(in_file, record, image, ground, seabed)
 
 
@@ -349,7 +367,7 @@ def _write_snippets(folder: Path, result: FileListing) -> None:
             write_png(folder / f"{name}.png", contact.image)
             write_side_car(folder / f"{name}.txt", contact.record)
         if contact.seabed is not None:
-            write_image(folder / f"{name}.tif", contact.seabed.image, contact.seabed.transform)
+            contact.seabed.write(folder / f"{name}.tif")
         if contact.ground is not None:
             write_png(folder / f"{name}-ground.png", contact.ground)
             changes = {

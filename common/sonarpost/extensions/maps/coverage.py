@@ -17,9 +17,9 @@ import numpy.typing as npt
 from sonarpost.export.geo.geometry import GeoPoint, geojson_geometry, split_ring
 from sonarpost.export.geo.geopackage import Layer, new_geopackage
 from sonarpost.export.text import utc_text
+from sonarpost.extensions.maps.track import Track, far_m, first_position, is_gap, no_positions, tracks, utm_epsg
 from sonarpost.files import atomic_file, write_atomically
 from sonarpost.sonar.geometry import Position
-from sonarpost.sonar.maps.track import Track, far_m, first_position, is_gap, no_positions, tracks, utm_epsg
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection
 from sonarpost.sonar.readers import open_survey

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sonarpost.extensions.maps.coverage import Coverage, outline_of
-from sonarpost.sonar.maps.geotiff import GeoTransform, write_tiles
-from sonarpost.sonar.maps.ground_canvas import MIN_RESOLUTION_M, GroundCanvas, checked_size
-from sonarpost.sonar.maps.track import first_position, tracks, utm_epsg
+from sonarpost.extensions.maps.geotiff import GeoTransform, write_tiles
+from sonarpost.extensions.maps.ground_canvas import MIN_RESOLUTION_M, GroundCanvas, checked_size
+from sonarpost.extensions.maps.track import first_position, tracks, utm_epsg
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection
 from sonarpost.sonar.readers import open_survey

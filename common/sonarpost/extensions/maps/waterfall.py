@@ -20,9 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.maps.geotiff import GeoTransform, write_tiles
-from sonarpost.sonar.maps.ground_canvas import MIN_RESOLUTION_M, GroundCanvas, checked_size
-from sonarpost.sonar.maps.track import Track, far_m, first_position, is_gap, no_positions, tracks, utm_epsg
+from sonarpost.extensions.maps.geotiff import GeoTransform, write_tiles
+from sonarpost.extensions.maps.ground_canvas import MIN_RESOLUTION_M, GroundCanvas, checked_size
+from sonarpost.extensions.maps.track import Track, far_m, first_position, is_gap, no_positions, tracks, utm_epsg
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection
 from sonarpost.sonar.readers import open_survey

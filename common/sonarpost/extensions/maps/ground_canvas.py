@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.extensions.maps.geotiff import TILE_PX, GeoTransform, Grey, check_size
+from sonarpost.extensions.maps.track import MAX_GAP_M, MAX_GAP_S, Track
 from sonarpost.sonar.ground_range import beam_normalised, ground_range_image
-from sonarpost.sonar.maps.geotiff import TILE_PX, GeoTransform, Grey, check_size
-from sonarpost.sonar.maps.track import MAX_GAP_M, MAX_GAP_S, Track
 from sonarpost.sonar.survey import FloatImage, Side
 
 FloatArray = npt.NDArray[np.float64]

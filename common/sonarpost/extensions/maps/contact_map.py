@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from sonarpost.detection.detector import Detection
-from sonarpost.sonar.maps.geotiff import GeoTransform, Grey
-from sonarpost.sonar.maps.ground_canvas import GroundCanvas
-from sonarpost.sonar.maps.track import track_of, utm_epsg
+from sonarpost.extensions.maps.geotiff import GeoTransform, Grey, write_image
+from sonarpost.extensions.maps.ground_canvas import GroundCanvas
+from sonarpost.extensions.maps.track import track_of, utm_epsg
 from sonarpost.sonar.projection import Projection
 from sonarpost.sonar.survey import Survey
 
@@ -26,6 +27,10 @@ class ContactMap:
 
     image: Grey
     transform: GeoTransform
+
+    def write(self, path: Path) -> None:
+        """Write it as GeoTIFF."""
+        write_image(path, self.image, self.transform)
 
 
 def contact_map(survey: Survey, detection: Detection, side_m: float, pixel_m: float) -> ContactMap | None:

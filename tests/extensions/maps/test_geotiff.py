@@ -5,10 +5,10 @@ import pytest
 import tifffile
 from builders import gdal
 
+from sonarpost.extensions.maps import geotiff
+from sonarpost.extensions.maps.geotiff import GeoTransform, write_image, write_tiles
+from sonarpost.extensions.maps.track import utm_epsg
 from sonarpost.sonar.geometry import Position
-from sonarpost.sonar.maps import geotiff
-from sonarpost.sonar.maps.geotiff import GeoTransform, write_image, write_tiles
-from sonarpost.sonar.maps.track import utm_epsg
 
 LAYOUTS = pytest.mark.parametrize(
     ("size_px", "is_big"), [((1, 1), False), ((512, 512), True), ((513, 5), False), ((1100, 1030), True)]

@@ -1,1 +1,0 @@
-"""Georeferenced images of recordings: track, canvas, waterfalls of lines, GeoTIFF files."""
