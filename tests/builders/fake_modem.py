@@ -153,9 +153,6 @@ class FakeModem:
     def _on_cccfq(self, name: str) -> None:
         self._schedule_reply(0.05, lambda: self.send("CACFG", name, self.settings[name]))
 
-    def _on_ccclk(self, *fields: str) -> None:
-        self._schedule_reply(0.05, lambda: self.send("CACLK", *fields))
-
     def _on_ccmsc(self, *fields: str) -> None:
         assert fields == (self.settings["SRC"], self.settings["SRC"], "0")
         self.restart()

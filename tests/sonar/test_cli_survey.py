@@ -10,7 +10,7 @@ from PIL import Image
 from pyproj import Transformer
 
 from sonarpost.cli.main import main
-from sonarpost.cli.survey.plot import SIDE_PX, angle_normalised, reduce_survey
+from sonarpost.cli.survey.plot import SIDE_PX, angle_normalised, reduce_survey, thinned_track
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.options import SurveyOptions
@@ -160,3 +160,12 @@ def test_ground_range_plot_removes_water_column_and_even_normalises():
     even = angle_normalised(ground).echo
     halves = np.nanmean(even[:, SIDE_PX + 60 : SIDE_PX + 200]), np.nanmean(even[:, SIDE_PX + 200 : SIDE_PX + 400])
     assert halves == pytest.approx((1, 1), abs=0.15)
+
+
+def test_track_is_thinned_evenly_and_keeps_end_points(small_survey):
+    ping = small_survey().pings[0]
+    track = thinned_track(dataclasses.replace(ping, lat_deg=10 + n * 1e-5) for n in range(30_000))
+    assert len(track) <= 4096
+    assert (track[0].lat_deg, track[-1].lat_deg) == (10, 10 + 29_999 * 1e-5)
+    steps = np.diff([position.lat_deg for position in track])[:-1]
+    assert steps.max() == pytest.approx(steps.min())
