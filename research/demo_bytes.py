@@ -41,9 +41,9 @@ from sonarpost.extensions.simulation.demo.settings import ROUTER_PORTS, UUV, VES
 from sonarpost.extensions.simulation.demo.watch import Watcher
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.link.frames.contact_record import RECORD_SIZE
 from sonarpost.messages import Command, ReconstructedImage, Relayed
-from sonarpost.sonar.xtf_writer import write_xtf
 
 TIMEOUT_S = 600.0
 IDLE_S = 3.0

@@ -42,9 +42,9 @@ from sonarpost.extensions.simulation.demo.settings import ROUTER_PORTS, VESSEL, 
 from sonarpost.extensions.simulation.demo.watch import Watcher
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Record
 from sonarpost.sonar.image_files import write_png
-from sonarpost.sonar.xtf_writer import write_xtf
 
 R = TypeVar("R", bound=Record)
 

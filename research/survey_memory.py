@@ -26,10 +26,10 @@ from pathlib import Path
 from sonarpost.cli.main import main as main_command
 from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
 from sonarpost.sonar.readers import open_survey
-from sonarpost.sonar.xtf_writer import write_xtf
 
 HEADER_BYTES = 1024
 PINGS = 200

@@ -10,8 +10,8 @@ import pytest
 
 import sonarpost
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.readers import read_survey
-from sonarpost.sonar.xtf_writer import write_xtf
 
 HEAVY = ("numba", "numpy", "scipy", "pydantic", "zenoh", "serial", "PIL")
 

@@ -34,9 +34,9 @@ from sonarpost.codec.registry import default_registry
 from sonarpost.delivery.outbox import Outbox
 from sonarpost.delivery.queue_sender import QueuePolicy
 from sonarpost.delivery.store import Store
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact, Health, ImagePart, Pixels, Snippet
 from sonarpost.services.console.store.users import Users
-from sonarpost.sonar.xtf_writer import write_xtf
 from sonarpost.stop_signals import EXIT_WITH_PARENT
 
 VESSEL, HOSTILE = "vessel-1", "vessel-2"

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from sonarpost.detection.settings import DetectorTuning
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey, snippets_of
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
-from sonarpost.sonar.xtf_writer import write_xtf
 
 START_S, PING_S, SAMPLES, RANGE_M, ALTITUDE_M, ALONG_M = 1.0e9, 0.1, 256, 20.0, 3.0, 0.1
 OBJECT_SAMPLE = 150

@@ -19,9 +19,9 @@ import zenoh
 from builders.common import eventually, publish_once
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact, Health, Pixels, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
-from sonarpost.sonar.xtf_writer import write_xtf
 
 SIMULATION = "sonarpost.extensions.simulation"
 """Tests that use it are skipped without that extension."""

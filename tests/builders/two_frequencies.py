@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
-from sonarpost.sonar.xtf_writer import write_xtf
 
 FIRST_HZ, SECOND_HZ = 900e3, 400e3
 

@@ -12,7 +12,7 @@ from sonarpost.cli import progress as module
 from sonarpost.cli.main import LOG_LEVEL_VARIABLE, main
 from sonarpost.cli.progress import ProgressDisplay, progress_console
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.sonar.xtf_writer import write_xtf
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 
 
 def test_state_has_step_amount_and_time():

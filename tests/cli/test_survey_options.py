@@ -12,10 +12,10 @@ from sonarpost.cli.shared import survey_options_of
 from sonarpost.config import load
 from sonarpost.errors import ConfigError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.sonar.options import SurveyOptions, load_options
 from sonarpost.sonar.readers import read_survey
-from sonarpost.sonar.xtf_writer import write_xtf
 
 EVERY_OPTION = """
 projected_crs = "EPSG:32616"

@@ -23,6 +23,7 @@ from sonarpost.detection.picks import (
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.stream import FileOrigin
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact
 from sonarpost.services.atd_stub.snippet_files import read_snippet
 from sonarpost.sonar.image_files import read_image
@@ -30,7 +31,6 @@ from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.side_car import read_side_car
 from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import Side
-from sonarpost.sonar.xtf_writer import write_xtf
 
 pytestmark = pytest.mark.usefixtures("few_candidates")
 

@@ -17,10 +17,10 @@ from sonarpost.detection.detector import detect
 from sonarpost.detection.stream import FileOrigin, StreamDetector
 from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals, masked_pings
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import ChannelPing, Ping, Side
-from sonarpost.sonar.xtf_writer import write_xtf
 
 pytestmark = pytest.mark.usefixtures("few_candidates")
 

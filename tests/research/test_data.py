@@ -12,9 +12,9 @@ from builders.common import REPOSITORY
 from research import prepare_data
 from research.common.images import read_sdvd_index
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.image_files import read_image, write_png
 from sonarpost.sonar.survey import Side
-from sonarpost.sonar.xtf_writer import write_xtf
 
 
 def sdvd_folder(root: Path) -> Path:

@@ -16,9 +16,9 @@ from research.recognition import __main__ as recognition
 from research.recognition.classifier import FOLDS, TargetClassifier
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.image_files import write_png
 from sonarpost.sonar.survey import Survey
-from sonarpost.sonar.xtf_writer import write_xtf
 
 
 def run(command: ModuleType, *arguments: object) -> int:

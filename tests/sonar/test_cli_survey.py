@@ -12,11 +12,11 @@ from pyproj import Transformer
 from sonarpost.cli.main import main
 from sonarpost.cli.survey.plot import SIDE_PX, angle_normalised, reduce_survey, thinned_track
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import ChannelPing, Side
-from sonarpost.sonar.xtf_writer import write_xtf
 
 
 def with_values(survey, **values):

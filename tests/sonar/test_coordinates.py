@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from pyproj import Transformer
 
 from sonarpost.cli.main import main
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.geometry import Position, along_track_m, offset_position
 from sonarpost.sonar.navigation import position_in_degrees
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection
 from sonarpost.sonar.readers import open_survey, read_survey
 from sonarpost.sonar.readers.xtf import decode_text
-from sonarpost.sonar.xtf_writer import write_xtf
 
 US_FOOT_M = 1200 / 3937
 

@@ -9,11 +9,11 @@ from builders.surveys import make_xtf
 
 from sonarpost import registry
 from sonarpost.errors import ConfigError, SurveyFileError
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar import readers
 from sonarpost.sonar.options import load_options
 from sonarpost.sonar.readers import open_survey, read_survey, recording_parts, supported_suffixes
 from sonarpost.sonar.source import InMemorySource
-from sonarpost.sonar.xtf_writer import write_xtf
 
 
 @pytest.fixture

@@ -21,10 +21,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import open_survey, read_survey
 from sonarpost.sonar.survey import Side
-from sonarpost.sonar.xtf_writer import write_xtf
 
 PINGS = 16
 FIRST_M, SECOND_M = 25.0, 60.0

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 from pyxtf import XTFPingHeader
 
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
 from sonarpost.sonar.options import Mounting, SurveyOptions
 from sonarpost.sonar.readers import open_survey, read_survey
-from sonarpost.sonar.xtf_writer import write_xtf
 
 HEADER, PACKET, PINGS = 1024, 512, 30
 START = Position(48.4459, -68.8283)

@@ -15,11 +15,11 @@ from pyproj import Transformer
 from pyxtf import XTFPingHeader
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.geometry import Position, offset_between_m, slant_to_ground_range_m
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Side
-from sonarpost.sonar.xtf_writer import write_xtf
 
 HEADER = 1024
 PACKET = 512

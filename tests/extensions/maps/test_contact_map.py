@@ -12,7 +12,7 @@ from sonarpost.detection import candidates
 from sonarpost.detection.detector import detect
 from sonarpost.extensions.maps.contact_map import contact_map
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.sonar.xtf_writer import write_xtf
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -20,8 +20,8 @@ from sonarpost.cli.main import main
 from sonarpost.errors import SurveyFileError
 from sonarpost.extensions.maps import track
 from sonarpost.extensions.maps.coverage import survey_coverage, write_coverage_geojson, write_coverage_geopackage
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.geometry import Position, offset_position
-from sonarpost.sonar.xtf_writer import write_xtf
 
 REACH_M = math.sqrt(RANGE_M**2 - ALTITUDE_M**2)
 GEOD = Geod(ellps="WGS84")

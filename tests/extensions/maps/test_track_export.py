@@ -9,7 +9,7 @@ import pytest
 from builders.surveys import make_xtf, small_survey
 
 from sonarpost.cli.main import main
-from sonarpost.sonar.xtf_writer import write_xtf
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 
 
 def test_export_csv(tmp_path, capsys):

@@ -16,6 +16,7 @@ from sonarpost.cli.main import main
 from sonarpost.detection.picks import Pick, parse_picks
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.errors import ConfigError
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.extensions.survey_view import waterfall as waterfall_module
 from sonarpost.extensions.survey_view.command import detected, stored_picks
 from sonarpost.extensions.survey_view.waterfall import Waterfall
@@ -23,7 +24,6 @@ from sonarpost.extensions.survey_view.web import DetectedContacts, SurveyViewApp
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import Side
-from sonarpost.sonar.xtf_writer import write_xtf
 
 __all__ = ["make_survey"]
 

@@ -10,13 +10,13 @@ from builders.joined_surveys import FEW_CANDIDATES, Box, near, split, survey_of
 from sonarpost.cli.main import main
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import StoredEnd, pack, unpack
 from sonarpost.services.atd_stub.input_folder import content_sha256
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey, snippets_of
 from sonarpost.sonar.readers import read_survey
-from sonarpost.sonar.xtf_writer import write_xtf
 
 
 def command_contacts(paths, capsys, *options):

@@ -23,12 +23,12 @@ from sonarpost.detection.settings import DetectorTuning
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamEnd
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import StoredEnd, pack, unpack
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
 from sonarpost.sonar.survey import Side
-from sonarpost.sonar.xtf_writer import write_xtf
 
 GOLDEN = GOLDEN_FOLDER / "atd_stub"
 HOLDING = AtdStubConfig(join_timeout_s=30.0)

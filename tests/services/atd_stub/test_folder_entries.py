@@ -12,11 +12,11 @@ from builders.surveys import make_xtf, small_survey
 
 from sonarpost.detection.stream import _FileSearch
 from sonarpost.errors import SurveyFileError
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.services.atd_stub import survey_detection
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey
 from sonarpost.sonar.image_files import write_tiff
-from sonarpost.sonar.xtf_writer import write_xtf
 
 HOLDING = AtdStubConfig(join_timeout_s=30.0)
 

@@ -20,6 +20,7 @@ from sonarpost.detection.snippets import ground_projected_image
 from sonarpost.detection.stream import FileOrigin
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.input_folder import InputFile, StableFiles, list_input_files
@@ -32,7 +33,6 @@ from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.side_car import SideCar, contact_text, read_side_car
 from sonarpost.sonar.source import load_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
-from sonarpost.sonar.xtf_writer import write_xtf
 
 FEW = DetectorSettings(**FEW_CANDIDATES.model_dump())
 ORIGIN = FileOrigin("ab" * 32, "line-7.xtf", "line-7")

@@ -13,12 +13,12 @@ from sonarpost import keys, wire
 from sonarpost.cli.detection.options import read_transmissions
 from sonarpost.delivery.store import Store
 from sonarpost.errors import DeliveryError
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Transmission, Transmissions
 from sonarpost.modem.interface import TransmissionEnded, TransmissionStarted
 from sonarpost.services.atd_stub.transmissions import MAX_RETAINED, RETAINED_S, SAVE_INTERVAL_S, TransmissionLog
 from sonarpost.services.uuv_modem.config import UuvModemConfig
 from sonarpost.services.uuv_modem.service import UuvModemService
-from sonarpost.sonar.xtf_writer import write_xtf
 
 KEY = keys.acoustic_transmissions("uuv-1")
 

@@ -17,8 +17,8 @@ from sonarpost.cli.main import main
 from sonarpost.extensions.simulation.demo.settings import UUV_ADDRESS
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.image_files import write_png, write_tiff
-from sonarpost.sonar.xtf_writer import write_xtf
 
 pytestmark = pytest.mark.chain
 

@@ -16,8 +16,8 @@ from builders.common import LONG_WAIT_S, REPOSITORY, eventually
 
 from sonarpost.extensions.simulation.demo.settings import reserved_ports
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.image_files import write_png
-from sonarpost.sonar.xtf_writer import write_xtf
 
 pytestmark = pytest.mark.chain
 

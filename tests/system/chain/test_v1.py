@@ -9,8 +9,8 @@ from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.extensions.simulation.demo.settings import STREAM_BYTES, UUV, VESSEL
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Command
-from sonarpost.sonar.xtf_writer import write_xtf
 
 pytestmark = pytest.mark.chain
 

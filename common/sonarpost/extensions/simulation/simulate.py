@@ -13,8 +13,8 @@ from sonarpost.cli.shared import flag, in_new_folder, option, projected_crs_of
 from sonarpost.errors import ConfigError
 from sonarpost.extensions.simulation.seabed.survey import SimulatedSurvey, SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.files import write_atomically
-from sonarpost.sonar.xtf_writer import write_xtf
 
 TRUTH_SCHEMA = 1
 

@@ -36,11 +36,11 @@ from sonarpost.extensions.simulation.demo.settings import (
 )
 from sonarpost.extensions.simulation.demo.watch import Watcher
 from sonarpost.extensions.simulation.modem.emulated import emulated_drivers
+from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.modem.registry import DEFAULT_DRIVER, modem_driver
 from sonarpost.services.console.store.users import FILE_NAME, LINK_S, Users, login_link
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.survey import Survey
-from sonarpost.sonar.xtf_writer import write_xtf
 
 MARKER = ".sonarpost-demo"
 QUIET_S = 1.5
