@@ -195,7 +195,7 @@ def test_feedback_completes_lost_images():
         vehicle.sender.add_image(number, replace(CONTACT, time_utc_s=float(number)), STREAM, 0.0)
     link = VesselEndpoint(CommandTracker(30.0), ReceiverConfig(feedback_interval_s=60.0))
     now, feedback_sent = 0.0, 0
-    while vehicle.sender.blocks or vehicle.sender.waiting:
+    while vehicle.sender.window.blocks or vehicle.sender.waiting:
         now += 6.0
         assert now < 3600
         for frame in next_frames(vehicle.sender, 3, now):

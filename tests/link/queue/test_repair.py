@@ -10,7 +10,7 @@ def test_delivered_images_and_received_parts_of_retired_blocks_are_not_sent_agai
         exchange.add(number)
         exchange.run(60.0, feedback=False)
     first = exchange.queue.sender.state.frames_sent
-    assert len(exchange.queue.sender.retired) == 14
+    assert len(exchange.queue.sender.window.retired) == 14
     there = sum(len(data) for data in exchange.shown.values())
     exchange.add(8)
     exchange.run(7200.0, feedback=True)

@@ -88,7 +88,9 @@ def test_free_frames_of_a_packet_carry_copies_and_symbols():
     queue.sender.expect_feedback(expected=True)
     packets = list(iter(lambda: take_packet(queue, 0.0), ()))
     assert {len(frames) for frames in packets} == {3}
-    assert sum(block.sent for block in queue.sender.blocks) > sum(b.source_symbols for b in queue.sender.blocks)
+    assert sum(block.sent for block in queue.sender.window.blocks) > sum(
+        b.source_symbols for b in queue.sender.window.blocks
+    )
 
 
 @pytest.mark.parametrize("kind", ["image of its own", "longer stream", "refine"])

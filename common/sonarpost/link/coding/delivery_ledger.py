@@ -142,15 +142,3 @@ def deletion_order(images: Mapping[int, OutgoingImage], config: SenderConfig, ne
     keep = set(needed)
     free = [image for number, image in images.items() if number not in keep]
     return [image.number for image in sorted(free, key=lambda i: missing_start(i, config, ()) is not None)]
-
-
-def take_reported(retired: list[SendBlock], feedback: Feedback) -> list[SendBlock]:
-    """Remove the blocks in a feedback from `retired`; return those of which the receiver has symbols."""
-    reported = [block for block in retired if feedback.missing_of(block.number) is not None]
-    retired[:] = [block for block in retired if block not in reported]
-    return [block for block in reported if feedback.missing_of(block.number) != NEVER_RECEIVED]
-
-
-def within_window(retired: Iterable[SendBlock], next_block: int) -> list[SendBlock]:
-    """Return the blocks that feedback can still mention, if `next_block` is the next number."""
-    return [block for block in retired if (next_block - block.number - 1) % BLOCKS < WINDOW]

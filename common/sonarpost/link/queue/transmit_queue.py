@@ -14,6 +14,7 @@ from typing import Annotated, Final
 from typing_extensions import override
 
 from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.coding.block_window import FIRST_URGENCY, LAST_URGENCY
 from sonarpost.link.coding.blocks import OutgoingImage, SendBlock
 from sonarpost.link.coding.channel_capacity import LossChannel, RateSelector
 from sonarpost.link.coding.redundancy_plan import copies, quality_curve
@@ -21,7 +22,7 @@ from sonarpost.link.config import QueueConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.v1.frame import SymbolKind
 from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES, Feedback, RefineRequest
-from sonarpost.link.frames.v1.sender import FIRST_URGENCY, LAST_URGENCY, V1Sender
+from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.queue.messages import FILLER_PRIORITY, MessageQueue
 from sonarpost.link.sender import ExpectedDelivery, ImageSender, ImageToSend, OutgoingPacket, SavedRate, SentImage
 from sonarpost.link.state import Bounds, Errors, PartReader, Parts, SavedCount, pack_part
@@ -285,7 +286,7 @@ class TransmitQueue(ImageSender):
         """Delete expired messages, stop to expect feedback that does not arrive, and select the rate."""
         self.messages.prune(now)
         last_s = self.last_feedback_s
-        if not self.sender.blocks:
+        if not self.sender.window.blocks:
             self._frames_at_feedback = self.sender.state.frames_sent  # receivers have nothing to report
         frames = self.sender.state.frames_sent - self._frames_at_feedback
         late = last_s is not None and not 0 <= now - last_s <= self.config.feedback_memory_s
@@ -327,7 +328,7 @@ class TransmitQueue(ImageSender):
     def open_numbers(self) -> set[int]:
         """Return the contact numbers of the images of which something is still to be sent."""
         waiting = {image.number for image in self.sender.waiting}
-        return waiting | {n for block in self.sender.blocks if block.left > 0 for n in self._live_contacts(block)}
+        return waiting | {n for block in self.sender.window.open_blocks for n in self._live_contacts(block)}
 
     def _live_contacts(self, block: SendBlock) -> list[int]:
         """Return the contact numbers of a block without those of stopped images, which it still holds."""
@@ -345,13 +346,13 @@ class TransmitQueue(ImageSender):
         frames_of = dict.fromkeys(self.open_numbers(), 0.0)
         previews: dict[int, float] = {}
         ahead = len(self.sender.state.messages.waiting) / 2
-        for block in [b for b in self.sender.blocks if b.is_fresh_preview and b.left > 0]:
+        for block in [b for b in self.sender.window.open_blocks if b.is_fresh_preview]:
             ahead += block.source_symbols - block.sent
             previews.update(dict.fromkeys(block.contacts, now + ahead * frame_s))
         for image in self.sender.waiting:
             ahead += not image.announced
             previews[image.number] = now + ahead * frame_s
-        open_blocks = [b for b in self.sender.blocks if b.left > 0]
+        open_blocks = self.sender.window.open_blocks
         for block in open_blocks:
             live = self._live_contacts(block)
             for number in live:

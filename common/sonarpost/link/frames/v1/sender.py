@@ -12,22 +12,14 @@ from typing import Annotated, Final
 
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.auth.authentication import FrameAuthenticator
-from sonarpost.link.coding.block_reduction import reduced_block
-from sonarpost.link.coding.blocks import (
-    BlockBuilder,
-    OutgoingImage,
-    SendBlock,
-    group_limit,
-    numbers_needed,
-)
+from sonarpost.link.coding.block_window import BlockWindow
+from sonarpost.link.coding.blocks import BlockBuilder, OutgoingImage, SendBlock, group_limit
 from sonarpost.link.coding.channel_capacity import LossChannel, Values
 from sonarpost.link.coding.delivery_ledger import (
     FeedbackTracker,
     deletion_order,
     missing_images,
     record_delivered,
-    take_reported,
-    within_window,
 )
 from sonarpost.link.coding.redundancy_plan import copies, quality_curve, symbols_to_send
 from sonarpost.link.config import SenderConfig
@@ -38,7 +30,6 @@ from sonarpost.link.frames.v1.frame import (
     Segment,
     SegmentKind,
     Symbol,
-    SymbolKind,
     pack_segments,
     pack_symbol,
     segments_room,
@@ -55,15 +46,9 @@ from sonarpost.link.queue.messages import MessageSender
 from sonarpost.link.state import Bounds, Errors, PartReader, Parts, SavedCount, pack_part
 
 _MIN_PREFIX_BYTES: Final = 16
-_MAX_SYMBOL_FACTOR: Final = 4
-"""Maximum ratio of symbols sent to source symbols, of a block without feedback while other images wait."""
 _NO_FEEDBACK_CAUTION: Final = -2.5
 """Argument `caution` of `symbols_to_send` for a block without feedback: 2.5 standard deviations above the average."""
 _ANY_PRIORITY: Final = -(2**31)
-FIRST_URGENCY: Final = 1e3
-"""Urgency of the blocks of an image that a command has moved to the front."""
-LAST_URGENCY: Final = 1e-3
-"""Urgency of the blocks of an image that a command has moved to the end."""
 
 
 @dataclass(eq=False)
@@ -71,7 +56,7 @@ class SenderState:
     """The small state of a sender, which changes with every frame.
 
     Attributes:
-        next_block: Number of the next block.
+        next_block: Number of the next block when the state was saved.
         frames_sent: Frames sent since the first start.
         messages: Messages in transmission.
         tracker: Receivers that send feedback.
@@ -98,10 +83,8 @@ class V1Sender:
 
     Attributes:
         waiting: Images that no block holds yet.
-        blocks: Blocks that are being sent, the oldest first.
-        retired: Blocks that were sent without feedback, and that feedback can still mention.
+        window: Blocks in transmission.
         kept: Images by number, the oldest first, including those that wait.
-        may_repair: Whether a part of a kept image may be neither delivered nor in a block.
         state: The rest of the state.
 
     Args:
@@ -116,9 +99,7 @@ class V1Sender:
         self.config = config
         self._protection = protection
         self.waiting: list[OutgoingImage] = []
-        self.blocks: list[SendBlock] = []
-        self.retired: list[SendBlock] = []
-        self.may_repair = True
+        self.window = BlockWindow(first_block)
         self.kept: dict[int, OutgoingImage] = {}
         self.state = SenderState(first_block % BLOCKS)
         self._packet_messages: list[Segment] = []
@@ -134,12 +115,12 @@ class V1Sender:
         return segments_room(self.config.frame_bytes, self._protection)
 
     def _builder(self, now: float) -> BlockBuilder:
-        return BlockBuilder(self.config, self.symbol_bytes, self._take_number, now)
+        return BlockBuilder(self.config, self.symbol_bytes, self.window.take_number, now)
 
     @property
     def is_idle(self) -> bool:
         """Whether there is nothing to send, and nothing that feedback can request."""
-        return not (self.waiting or self.blocks or self.state.messages.waiting)
+        return not (self.waiting or self.window.blocks or self.state.messages.waiting)
 
     def add_image(
         self,
@@ -183,7 +164,9 @@ class V1Sender:
         """Delete images beyond the limit, completely delivered ones first; none that is still to be sent."""
         excess = len(self.kept) - self.config.kept_images
         if excess > 0:
-            needed = {image.number for image in self.waiting} | {n for block in self.blocks for n in block.contacts}
+            needed = {image.number for image in self.waiting} | {
+                n for block in self.window.blocks for n in block.contacts
+            }
             for number in deletion_order(self.kept, self.config, needed)[:excess]:
                 del self.kept[number]
 
@@ -224,16 +207,9 @@ class V1Sender:
         if expected == self.config.feedback:
             return
         self.config = replace(self.config, feedback=expected)
-        self.may_repair = True
+        self.window.may_repair = True
         if not expected:
-            for block in [b for b in self.blocks if b.left <= 0]:
-                self._retire(block)
-
-    def _retire(self, block: SendBlock) -> None:
-        self.blocks.remove(block)
-        block.retired = True
-        self.retired += [block] if block.spans else []
-        self.may_repair = True
+            self.window.retire_completed()
 
     def resize(self, frame_bytes: int) -> None:
         """Use another frame length.
@@ -241,13 +217,7 @@ class V1Sender:
         Blocks with symbols that are too long for it are given up; their images wait again.
         """
         self.config = replace(self.config, frame_bytes=frame_bytes)
-        room = self._segments_room
-        lost = [b for b in self.blocks if b.symbol_bytes != self.symbol_bytes and b.symbol_bytes + 5 > room]
-        self.blocks = [b for b in self.blocks if b not in lost]
-        self.retired = [b for b in self.retired if b.symbol_bytes == self.symbol_bytes or b.symbol_bytes + 5 <= room]
-        self.may_repair = True
-        waiting = {image.number for image in self.waiting}
-        again = {number for block in lost for number in block.contacts} - waiting
+        again = self.window.resize(self.symbol_bytes, self._segments_room) - {image.number for image in self.waiting}
         self.waiting = [image for number, image in self.kept.items() if number in again] + self.waiting
 
     def next_frame(self, now: float, *, images_first: bool = False) -> bytes | None:
@@ -281,12 +251,12 @@ class V1Sender:
             frame: bytes | None = pack_segments(self._packet_messages, self.config.frame_bytes, self._protection)
             self._packet_messages = []
         else:
-            frame = self._symbol_frame(now) if self.config.feedback and self._extend_least_redundant_block() else None
+            frame = self._symbol_frame(now) if self.config.feedback and self.window.extend_least_redundant() else None
         self.state.frames_sent += frame is not None
         return frame
 
     def _images_frame(self, now: float) -> bytes | None:
-        if self.config.announce and not any(b.is_fresh_preview and b.left > 0 for b in self.blocks):
+        if self.config.announce and not any(b.is_fresh_preview for b in self.window.open_blocks):
             # Contacts whose group waits precede the detail of others.
             announced = self._announcements(self._segments_room)
             if announced:
@@ -302,63 +272,37 @@ class V1Sender:
             oldest_s = min(image.added_s for image in self.waiting)
             due = len(self.waiting) >= limit or now - oldest_s >= self.config.group_delay_s
             group = self.waiting[:limit]
-            if not due or not self._may_begin(group):
+            if not due or not self.window.may_begin(group, self.config, self.symbol_bytes):
                 return
             self.waiting = self.waiting[limit:]
             for image in group:
                 image.announced = False
-            self.blocks += self._builder(now).group(group)
-
-    def _may_begin(self, group: Sequence[OutgoingImage]) -> bool:
-        previews = sum(1 for b in self.blocks if b.kind == SymbolKind.PREVIEW and b.left > 0)
-        details = sum(
-            1 for b in self.blocks if b.kind != SymbolKind.PREVIEW and b.left > 0 and b.urgency != LAST_URGENCY
-        )
-        if max(previews, details) >= self.config.depth:
-            return False
-        # A group that does not even fit an empty window need not wait.
-        return not self.blocks or self._free_numbers() >= numbers_needed(group, self.config, self.symbol_bytes)
+            self.window.blocks += self._builder(now).group(group)
 
     def _begin_repairs(self, now: float) -> None:
         """With feedback, send missing parts again when no new group is due."""
-        if not (self.config.feedback and self.may_repair):
+        if not (self.config.feedback and self.window.may_repair):
             return
         waiting = {image.number for image in self.waiting}
         kept = [image for number, image in self.kept.items() if number not in waiting]
-        found = missing_images(kept, self.config, self.blocks, group_limit(self.config, self.symbol_bytes))
+        found = missing_images(kept, self.config, self.window.blocks, group_limit(self.config, self.symbol_bytes))
         if not found:
-            self.may_repair = False
+            self.window.may_repair = False
             return
         group = [image for image, _ in found]
-        if not self._may_begin(group):
+        if not self.window.may_begin(group, self.config, self.symbol_bytes):
             return
         for image, start in found:
             image.goal, image.sent = image.goal_bytes(self.config.stream_bytes), start
         builder = self._builder(now)
-        self.blocks += builder.group(group) if found[0][1] == 0 else builder.unlayered(group)
-
-    def _free_numbers(self) -> int:
-        if not self.blocks:
-            return WINDOW
-        return WINDOW - (self.state.next_block - self.blocks[0].number) % BLOCKS
-
-    def _take_number(self) -> int:
-        # A block beyond the window replaces the oldest: receivers delete it too.
-        while self._free_numbers() < 1:
-            self.blocks.pop(0)
-            self.may_repair = True
-        number = self.state.next_block
-        self.state.next_block = (number + 1) % BLOCKS
-        # A new block must never be mistaken for a retired one with the same number.
-        self.retired = within_window(self.retired, self.state.next_block)
-        return number
+        self.window.blocks += builder.group(group) if found[0][1] == 0 else builder.unlayered(group)
 
     def _begin_long_messages(self, now: float) -> None:
         room = self._segments_room - 2
-        while self._free_numbers() >= 1 and (message := self.state.messages.take_long(room)) is not None:
+        while self.window.free_numbers >= 1 and (message := self.state.messages.take_long(room)) is not None:
             block = self._builder(now).message(message.number, message.data)
             block.planned = self._planned_without_feedback(block)
-            self.blocks.append(block)
+            self.window.blocks.append(block)
 
     def _planned_without_feedback(self, block: SendBlock) -> int:
         return min(255, symbols_to_send(block.source_symbols, self.config.worst, _NO_FEEDBACK_CAUTION))
@@ -379,7 +323,7 @@ class V1Sender:
     def _fillers(self, room: int) -> list[Segment]:
         """Return segments for the rest of a frame: symbols, then contacts that wait."""
         found: list[Segment] = []
-        while room > 0 and (symbol := self._next_symbol(max_bytes=room - 5)) is not None:
+        while room > 0 and (symbol := self._next_symbol(room - 5)) is not None:
             found.append(Segment(SegmentKind.SYMBOL, symbol.head() + symbol.data))
             room -= found[-1].size
         return found + self._announcements(room)
@@ -403,11 +347,11 @@ class V1Sender:
         return found
 
     def _symbol_frame(self, now: float) -> bytes | None:
-        symbol = self._next_symbol(max_bytes=self.symbol_bytes)
+        symbol = self._next_symbol(self.symbol_bytes)
         if symbol is None:
-            self._send_reminders(now)
+            self.window.send_reminders(now, self.config.max_defer_s)
             self._extend_unconfirmed_block()
-            symbol = self._next_symbol(max_bytes=self.symbol_bytes)
+            symbol = self._next_symbol(self.symbol_bytes)
         if symbol is None:
             return None
         if len(symbol.data) == self.symbol_bytes:
@@ -417,46 +361,21 @@ class V1Sender:
         return pack_segments([first, *self._fillers(room)], self.config.frame_bytes, self._protection)
 
     def _next_symbol(self, max_bytes: int) -> Symbol | None:
-        """Return the most valuable symbol that fits."""
-        open_blocks = [b for b in self.blocks if b.left > 0 and b.symbol_bytes <= max_bytes]
-        if not open_blocks:
-            return None
-        block = min(open_blocks, key=_order_of_sending)
-        symbol = block.next_symbol()
-        if block.left <= 0 and not self.config.feedback:
-            self._retire(block)
-        return symbol
-
-    def _send_reminders(self, now: float) -> None:
-        """With feedback, send a few symbols more of blocks without feedback for long: they trigger feedback."""
-        for block in self._overdue_blocks(now):
-            block.last_activity_s = now
-            block.planned += max(1, block.source_symbols // 16)
-
-    def _overdue_blocks(self, now: float) -> list[SendBlock]:
-        for block in self.blocks:
-            block.last_activity_s = min(block.last_activity_s, now)  # later only after the clock was set back
-        return [b for b in self.blocks if b.left <= 0 and now - b.last_activity_s >= self.config.max_defer_s]
+        return self.window.next_symbol(max_bytes, feedback=self.config.feedback)
 
     def images_are_due(self, now: float) -> bool:
         """Whether there is something to send of images, including reminders."""
-        return bool(self.waiting) or any(b.left > 0 for b in self.blocks) or bool(self._overdue_blocks(now))
+        return bool(self.waiting or self.window.open_blocks or self.window.overdue(now, self.config.max_defer_s))
 
     def _extend_unconfirmed_block(self) -> None:
         """With feedback, while the next group waits for block numbers, send more of the least redundant block.
 
         Plans stay below the expected need, so most of these symbols are useful.
         """
-        if not self.waiting or any(b.left > 0 for b in self.blocks) or not self.config.feedback:
+        if not self.waiting or self.window.open_blocks or not self.config.feedback:
             return
-        if self._free_numbers() < WINDOW:
-            self._extend_least_redundant_block()
-
-    def _extend_least_redundant_block(self) -> bool:
-        candidates = [b for b in self.blocks if b.sent < _MAX_SYMBOL_FACTOR * b.source_symbols]
-        if candidates:
-            min(candidates, key=lambda b: b.sent / b.source_symbols).planned += 1
-        return bool(candidates)
+        if self.window.free_numbers < WINDOW:
+            self.window.extend_least_redundant()
 
     def on_feedback(self, feedback: Feedback | RefineRequest, now: float, receiver: int = 0) -> None:
         """Process feedback or a request.
@@ -482,17 +401,12 @@ class V1Sender:
         self._apply(Feedback(block_number, 0, (missing_symbols,)), now, receiver)
 
     def _apply(self, feedback: Feedback, now: float, receiver: int) -> None:
-        self._resume_retired(feedback)
-        self.blocks, done = self.state.tracker.apply(feedback, self.blocks, self.config, now, receiver)
+        window = self.window
+        if self.config.feedback:
+            window.resume_retired(feedback)
+        window.blocks, done = self.state.tracker.apply(feedback, window.blocks, self.config, now, receiver)
         record_delivered(self.kept, done)
         self._drop_stopped()
-
-    def _resume_retired(self, feedback: Feedback) -> None:
-        """Continue blocks that were sent before the first feedback, if a receiver has some of their symbols."""
-        if self.config.feedback and (found := take_reported(self.retired, feedback)):
-            for block in found:
-                block.retired = False
-            self.blocks = sorted([*self.blocks, *found], key=lambda b: (b.number - self.state.next_block) % BLOCKS)
 
     def refine(self, request: RefineRequest, now: float) -> bool:
         """Send more detail of an image than was planned; return whether there is any.
@@ -511,7 +425,7 @@ class V1Sender:
         for block in made:
             if not self.config.feedback:
                 block.planned = self._planned_without_feedback(block)
-        self.blocks += made
+        self.window.blocks += made
         return bool(made)
 
     def stop(self, number: int) -> bool:
@@ -548,48 +462,41 @@ class V1Sender:
         if image is None:
             return False
         self.resume(number, now)
-        has_numbers = self._free_numbers() >= numbers_needed([image], self.config, self.symbol_bytes)
+        has_numbers = self.window.has_numbers_for([image], self.config, self.symbol_bytes)
         if image in self.waiting:
             self.waiting.remove(image)
             if first and has_numbers:
-                self.blocks += self._builder(now).group([image])
+                self.window.blocks += self._builder(now).group([image])
             else:
                 self.waiting.insert(0 if first else len(self.waiting), image)
-        elif has_numbers and self._leave_shared_blocks({number}):
+        elif has_numbers and self._leave_out({number}, shared_only=True):
             self.refine(RefineRequest(number, image.goal_bytes(self.config.stream_bytes)), now)
-        for block in self.blocks:
-            if number in block.contacts and block.kind != SymbolKind.PREVIEW:
-                block.urgency = FIRST_URGENCY if first else LAST_URGENCY
+        self.window.move(number, first=first)
         return True
 
     def _drop_stopped(self) -> None:
         """Leave out stopped images from the blocks that are being sent."""
         stopped = {number for number, image in self.kept.items() if image.stopped}
         if stopped:
-            self._reduce_blocks(self.blocks, stopped)
+            self._leave_out(stopped)
 
-    def _leave_shared_blocks(self, numbers: set[int]) -> bool:
-        """Leave out images from the blocks that they share with others; return whether there was such a block."""
-        return self._reduce_blocks([b for b in self.blocks if not numbers.issuperset(b.contacts)], numbers)
+    def _leave_out(self, numbers: set[int], *, shared_only: bool = False) -> bool:
+        def unsent(number: int, link: int, start: int) -> None:
+            image = self.kept.get(number)
+            if image is not None and image.link == link:
+                image.sent = min(image.sent, start)
 
-    def _reduce_blocks(self, blocks: Sequence[SendBlock], dropped: set[int]) -> bool:
-        reduced = {block.number: made for block in blocks if (made := reduced_block(block, dropped, self.config.worst))}
-        for block in [b for b in blocks if b.number in reduced]:
-            for number, link, start, _ in block.spans:
-                image = self.kept.get(number)
-                if number in dropped and image is not None and image.link == link:
-                    image.sent = min(image.sent, start)
-        self.blocks = [reduced.get(block.number, block) for block in self.blocks]
-        return bool(reduced)
+        return self.window.leave_out(numbers, self.config.worst, unsent, shared_only=shared_only)
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`."""
         waiting = WaitingImages([image.number for image in self.waiting])
-        parts = {"sender": pack_part(self.state), "waiting": pack_part(waiting)}
+        state = replace(self.state, next_block=self.window.next_block)
+        parts = {"sender": pack_part(state), "waiting": pack_part(waiting)}
         for image in {image.number: image for image in (*self.kept.values(), *self.waiting)}.values():
             parts[f"image/{image.number}"] = pack_part(image)
             parts[f"image-progress/{image.number}"] = pack_part(image, "progress")
-        for block in (*self.blocks, *self.retired):
+        for block in (*self.window.blocks, *self.window.retired):
             parts[f"block/{block.number}"] = pack_part(block)
             parts[f"block-progress/{block.number}"] = pack_part(block, "progress")
         return parts
@@ -614,22 +521,6 @@ class V1Sender:
             self.waiting = [image for image in self.kept.values() if missing_images([image], self.config, (), 1)]
             for image in self.waiting:
                 image.sent = 0
-        blocks.sort(key=lambda b: (b.number - state.next_block) % BLOCKS)
-        self.blocks = [block for block in blocks if not block.retired]
-        self.retired = [block for block in blocks if block.retired]
-        self.state, self.may_repair = state, True
+        self.state, self.window.next_block = state, state.next_block
+        self.window.restore(blocks)
         return reader.errors
-
-
-def _order_of_sending(block: SendBlock) -> tuple[bool, bool, bool, bool, float]:
-    """Return the sort key of a block: the smallest goes next, of equal ones the oldest.
-
-    Requested symbols complete something, so they precede the others.
-    """
-    return (
-        block.urgency == LAST_URGENCY,
-        not block.is_fresh_preview,
-        block.urgency != FIRST_URGENCY,
-        not block.reported,
-        0.0 if block.reported else block.progress,
-    )
