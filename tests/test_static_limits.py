@@ -23,7 +23,6 @@ THREADS = {
     "common/sonarpost/bus/router.py": "health of the router",
     "common/sonarpost/cli/c2/tasking.py": "timer that sets an event",
     "common/sonarpost/cli/deployment/run_all.py": "copies the output of a process",
-    "common/sonarpost/cli/metrics.py": "serves requests, each in a thread that logs its exceptions",
     "common/sonarpost/cli/progress.py": "prints progress",
     "common/sonarpost/delivery/inbox.py": "guarded: accepts records",
     "common/sonarpost/delivery/outbox.py": "guarded: starts senders",

@@ -25,7 +25,6 @@ from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.config import ModemTable, PlatformConfig, ServiceConfig, table_names
 from sonarpost.messages import Record
 from sonarpost.monitoring.fleet import FleetState
-from sonarpost.monitoring.metrics import FleetCollector
 from sonarpost.registry import EXTENSIONS
 
 UNITS = {
@@ -196,6 +195,8 @@ def image_table(_: str = "") -> str:
 
 def metrics(_: str = "") -> str:
     """Return the table of the metrics that do not depend on a service's counters and gauges."""
+    from sonarpost.extensions.metrics.collector import FleetCollector  # noqa: PLC0415 it can be removed
+
     rows = []
     for family in FleetCollector(lambda: FleetState(services=(), connected=True, rejected=0)).collect():
         name = family.name + ("_total" if family.type == "counter" else "")

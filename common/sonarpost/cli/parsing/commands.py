@@ -70,11 +70,6 @@ COMMANDS: Final[Mapping[str, CommandSpec]] = {
         "--view out",
         _WEB,
     ),
-    "metrics": CommandSpec(
-        "serve the health of all platforms to Prometheus",
-        "sonarpost.cli.metrics:add_options",
-        "--router tcp/127.0.0.1:7447 --port 9464",
-    ),
     "survey": CommandSpec(
         "describe, draw, view and export recordings of side-scan sonars", "sonarpost.cli.survey:add_actions"
     ),

@@ -12,8 +12,8 @@ from sonarpost import logs
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.shared import add_router_options, log_level, option, router_of
 from sonarpost.errors import PortError
+from sonarpost.extensions.metrics.collector import FleetCollector, registry_of
 from sonarpost.monitoring.fleet import FleetTracker, FleetWatcher
-from sonarpost.monitoring.metrics import FleetCollector, registry_of
 from sonarpost.network.connections import ConnectionLimits, LimitedHandler, LimitedServer
 from sonarpost.stop_signals import stop_on_signals
 
