@@ -130,5 +130,5 @@ def test_image_decoded_by_the_decompressor(runner, platform, tmp_path):
     process(range(100, 100 + CONTACTS // 5))
     many = written_per_image(2000)
     record_bytes = len(wire.encode(contact_only(1))) + len(wire.encode(relay.received[0]))
-    assert few - record_bytes <= 10_000
-    assert many == pytest.approx(few, rel=0.1)
+    assert few - record_bytes <= 8192
+    assert abs(many - few) <= 1024, "two pages: the table of accepted records has one more level"

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import sqlite3
 import uuid
-
-from sonarpost.logs import kv
-
-log = logging.getLogger(__name__)
 
 VERSION = 4
 
@@ -49,12 +44,11 @@ CREATE INDEX IF NOT EXISTS outbox_topic ON outbox (consumer, topic, edition) WHE
 """
 
 
-def prepare(db: sqlite3.Connection, page_bytes: int) -> tuple[bytes, bytes]:
+def prepare(db: sqlite3.Connection) -> tuple[bytes, bytes]:
     """Create the tables of a new store.
 
     Args:
         db: Connection without an open transaction.
-        page_bytes: Size of the pages.
 
     Returns:
         Version of the schema as text, which differs from `VERSION` for a store of another version, whose tables are
@@ -67,7 +61,6 @@ def prepare(db: sqlite3.Connection, page_bytes: int) -> tuple[bytes, bytes]:
     version = _stored_version(db)
     if version not in (current, None):
         return version, b""
-    _convert_page_size(db, page_bytes)
     db.executescript(_TABLES)
     with db:
         db.execute("BEGIN IMMEDIATE")
@@ -89,18 +82,3 @@ def _meta(db: sqlite3.Connection, name: str, initial: bytes) -> bytes:
     db.execute("INSERT OR IGNORE INTO meta VALUES (?, ?)", (name, initial))
     row = db.execute("SELECT value FROM meta WHERE name = ?", (name,)).fetchone()
     return bytes(row[0])
-
-
-def _convert_page_size(db: sqlite3.Connection, page_bytes: int) -> None:
-    """Convert a file with another page size, for example one that `sonarpost store salvage` has written."""
-    if db.execute("PRAGMA page_size").fetchone()[0] == page_bytes:
-        return
-    try:
-        # The conversion is not possible with a write-ahead log.
-        db.execute("PRAGMA journal_mode=DELETE")
-        db.execute(f"PRAGMA page_size={page_bytes}")
-        db.execute("VACUUM")
-    except sqlite3.OperationalError as error:
-        # A full disk: the file is still valid, and the next start tries again.
-        log.warning("Store keeps its page size", extra=kv(reason=str(error)))
-    db.execute("PRAGMA journal_mode=WAL")

@@ -225,7 +225,7 @@ def salvage(path: Path, out: Path) -> list[TableResult]:
             raise StoredFileError(str(path), "version", version, str(VERSION))
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=".salvage.") as folder:
             new = Path(folder) / "new.db"
-            Store(new).close()
+            Store(new, page_bytes=source.execute("PRAGMA page_size").fetchone()[0]).close()
             with closing(sqlite3.connect(new, isolation_level=None)) as target, target:
                 target.execute("BEGIN")
                 target.execute("DELETE FROM sqlite_sequence")

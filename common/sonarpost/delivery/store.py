@@ -89,7 +89,7 @@ class Store:
     Args:
         path: The SQLite file.
         page_bytes: Size of its pages, a power of two from 512 to 65536. A transaction writes whole pages: small ones
-            suit frequent small changes. An existing file is converted.
+            suit frequent small changes. An existing file keeps its size.
 
     Raises:
         DeliveryError: The file cannot be opened or is not a store of this version.
@@ -124,14 +124,15 @@ class Store:
             on_error.callback(self._db.close)
             self._db.execute(f"PRAGMA page_size={self._page_bytes}")
             self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute(f"PRAGMA wal_autocheckpoint={CHECKPOINT_BYTES // self._page_bytes}")
+            page_bytes = int(self._db.execute("PRAGMA page_size").fetchone()[0])
+            self._db.execute(f"PRAGMA wal_autocheckpoint={CHECKPOINT_BYTES // page_bytes}")
             self._db.execute("PRAGMA synchronous=FULL")
             self._db.execute("PRAGMA foreign_keys=ON")
             # Some builds of SQLite overwrite deleted content, which writes every record to the disk a second time.
             self._db.execute("PRAGMA secure_delete=OFF")
             self._db.execute(f"PRAGMA cache_size={-CACHE_KB}")
             self._require_sound()
-            version, self.origin = schema.prepare(self._db, self._page_bytes)
+            version, self.origin = schema.prepare(self._db)
             self._reader = sqlite3.connect(
                 self.path, check_same_thread=False, isolation_level=None, timeout=BUSY_TIMEOUT_S
             )
