@@ -14,6 +14,7 @@ from sonarpost.archive.image_files import write_image
 from sonarpost.archive.shore_files import decision_file_name
 from sonarpost.export.contacts import ContactSet, ExportContact, ImageSideCar, side_car
 from sonarpost.export.formats import exporters
+from sonarpost.export.live import LiveContacts
 from sonarpost.export.source import ExportSource, StoredImages
 from sonarpost.messages import Contact, Decision, Pixels, ReconstructedImage
 
@@ -55,6 +56,22 @@ def image(image_id: str = "00A7", contact: dict[str, Any] | None = None, **chang
         "last_frame_utc_s": FIRST_UTC_S + 30,
     }
     return reconstructed_image(packed, **(fields | changes))
+
+
+def contact_of(image_id: str = "00A7", vessel_id: str = "vessel-1", **fields: Any) -> ExportContact:
+    """Return the live contact of an image."""
+    found = LiveContacts().add(image(image_id, fields, vessel_id=vessel_id))
+    assert found is not None
+    return found
+
+
+class Clock:
+    """A clock that a test sets."""
+
+    now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
 
 
 def decision(image_id: str = "00A7", **changes: Any) -> Decision:

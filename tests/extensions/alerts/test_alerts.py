@@ -16,7 +16,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 from builders.common import WAIT_S, eventually, free_port
-from builders.exports import decision, image, store
+from builders.exports import Clock, contact_of, decision, image, store
 from builders.unreached_router import check_unreached_router
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
@@ -33,20 +33,6 @@ from sonarpost.security.client_tls import TlsFiles
 from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
 
 SECRET = b"0123456789abcdef"
-
-
-def contact_of(image_id="00A7", vessel_id="vessel-1", **fields):
-    found = LiveContacts().add(image(image_id, fields, vessel_id=vessel_id))
-    assert found is not None
-    return found
-
-
-class Clock:
-    def __init__(self):
-        self.now_s = 100.0
-
-    def __call__(self):
-        return self.now_s
 
 
 def test_score():

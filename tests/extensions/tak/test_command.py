@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from builders.common import eventually, free_port
-from builders.exports import image, store
+from builders.exports import Clock, image, store
 from builders.tls_authority import Authority
 from extensions.tak.tak_server import TakServer
 
@@ -97,13 +97,6 @@ def test_once_needs_an_archive_and_reports_rejected_files(archive, capsys):
     assert "rejected: " in capsys.readouterr().err
     assert server.events() == 2
     server.close()
-
-
-class Clock:
-    now_s = 100.0
-
-    def __call__(self):
-        return self.now_s
 
 
 def test_live_service_counts_what_the_server_has_received(authority, tmp_path):

@@ -14,31 +14,16 @@ from xml.etree import ElementTree as ET
 import pytest
 import xmlschema
 from builders.common import WAIT_S, free_port, publish_once
-from builders.exports import image, store
+from builders.exports import Clock, contact_of, image, store
 from builders.unreached_router import check_unreached_router
 
 from sonarpost import keys, wire
 from sonarpost.cli.c2.live import ContactChange
 from sonarpost.cli.main import main
 from sonarpost.errors import PortError
-from sonarpost.export.live import LiveContacts
 from sonarpost.extensions.tak import command
 from sonarpost.extensions.tak.command import MAX_IMAGES, REFRESH_S, RETRY_S, CotService
 from sonarpost.extensions.tak.data_package import PackageRefusedError, UploadedPackage, attachment_sha256
-
-
-def contact_of(image_id="00A7", vessel_id="vessel-1", **fields):
-    found = LiveContacts().add(image(image_id, fields, vessel_id=vessel_id))
-    assert found is not None
-    return found
-
-
-class Clock:
-    def __init__(self):
-        self.now_s = 100.0
-
-    def __call__(self):
-        return self.now_s
 
 
 class Events:

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import random
 import runpy
 import select
 import signal
@@ -24,7 +23,6 @@ from sonarpost.cli.main import main, parser
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.extensions.simulation.acoustic_channel.config import AcousticChannelConfig
 from sonarpost.extensions.simulation.acoustic_channel.service import AcousticChannelService
-from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.config import EmulatorConfig, ModemSite
 from sonarpost.extensions.simulation.channel.emulator import ChannelEmulator
 from sonarpost.messages import Health
@@ -227,29 +225,6 @@ def test_new_tcp_client_replaces_the_previous_one(make):
         eventually(lambda: first.wait(0.05) is not None)
 
 
-def test_noise_is_answered_with_errors(make):
-    emulator = make(tcp_ports=(0, 0))
-    host = Host(emulator.devices()[0].device)
-    host.write(random.Random(5).randbytes(20_000) + b"\r\n$CCCYC,0,1,2,1,0,1*00\r\n")
-    host.expect("CAERR")
-    host.send_sentence("CCCFQ", "XST")
-    eventually(
-        lambda: host.wait(0.02) or ("XST", "1") in [s.fields for s in host.sentences], what="answer after garbage"
-    )
-
-
-def test_data_timeout_is_two_seconds_of_real_time(make):
-    emulator = make(time_scale=1000.0)
-    host = Host(emulator.devices()[0].device)
-    started_s = time.monotonic()
-    host.send_sentence("CCCYC", 0, 1, 2, 1, 0, 1)
-    host.expect("CAERR")
-    assert time.monotonic() - started_s > 1.9
-    timeout = next(sentence for sentence in host.sentences if sentence.kind == "CAERR")
-    assert timeout.fields[1:] == ("DATA_TIMEOUT", "1")
-    assert emulator.totals().transmitted == 0
-
-
 def test_client_that_does_not_read_loses_whole_sentences(make):
     emulator = make(tcp_ports=(0, 0))
     device = emulator.devices()[0].device
@@ -276,17 +251,6 @@ def test_air_time_is_scaled(make):
     host.send_sentence("CCTXD", 1, 2, 0, "AA")
     host.expect("CATXF")
     assert time.monotonic() - started_s >= 0.5
-
-
-def test_moved_modem(make, tmp_path):
-    emulator = make()
-    sender, receiver = hosts_of(emulator)
-    emulator.move(2, LocalPosition(300.0))
-    sender.send(2, 1, [b"abc"])
-    receiver.expect("CACST")
-    emulator.stop()
-    assert log_of(tmp_path / "channel.jsonl", "packet")[0]["range_m"] == 300.0
-    assert log_of(tmp_path / "channel.jsonl", "move")[0]["modem"] == 2
 
 
 def test_port_error_names_the_port(make, tmp_path):
