@@ -16,7 +16,7 @@ SOCKETS = {
     "common/sonarpost/bus/connectivity.py": "probes: three waits of at most 3 s; the signal thread ends the process",
     "common/sonarpost/network/connections.py": "limits of a server's connections",
     "common/sonarpost/network/http_client.py": "one deadline for the whole exchange",
-    "common/sonarpost/runtime/udp_port.py": "datagrams; the socket has a time limit",
+    "common/sonarpost/runtime/modem_port.py": "datagrams; the socket has a time limit",
     "common/sonarpost/stop_signals.py": "signals of this process",
 }
 THREADS = {

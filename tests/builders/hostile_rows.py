@@ -439,7 +439,7 @@ ROWS: tuple[Row, ...] = (
     Row(("queryable:archive.codebook_transfer",), "shore", "junk", "tests/services/test_codebook_transfer.py"),
     Row(("subscriber:bus.catch_up", "subscriber:cli.c2.watch"), "vessel", "junk", "tests/cli/test_c2_live.py"),
     Row(("subscriber:monitoring.fleet",), "vessel", "junk", "tests/monitoring/test_fleet.py"),
-    Row(("port:runtime.udp_port",), "another host", "junk", "tests/modem/test_udp.py"),
+    Row(("port:runtime.modem_port",), "another host", "junk", "tests/modem/test_udp.py"),
     Row(("folder:platform.state_dir",), "a damaged disk", "junk", "tests/runtime/test_store_damage.py"),
     Row(("folder:platform.tls.*",), "a file", "junk", "tests/security/test_tls_files.py"),
     Row(("folder:platform.acoustic_key_file",), "a file", "junk", "tests/security/test_acoustic_key.py"),

@@ -8,10 +8,9 @@ import pytest
 from builders.common import WAIT_S, eventually, free_port
 
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.runtime.modem_port import open_modem_port
+from sonarpost.runtime.modem_port import UdpPort, open_modem_port
 from sonarpost.runtime.serial_modem import SerialModem
 from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialPort
-from sonarpost.runtime.udp_port import UdpPort
 
 URL = f"udp://239.255.77.1:{free_port()}?interface=127.0.0.1&ttl=0"
 
