@@ -74,7 +74,7 @@ def test_the_example_sets_every_option(options):
 def test_every_command_and_the_vehicle_use_the_same_options(crs, options, tmp_path, monkeypatch, config):
     given = ["--options", str(options), *crs]
     want = load_options(options).model_copy(update={"projected_crs": (crs or ["", "EPSG:32616"])[1]})
-    for command in (["detect", "x.xtf"], *(["survey", name, "x.xtf"] for name in ("info", "plot", "export"))):
+    for command in (["detect", "x.xtf"], *(["survey", name, "x.xtf"] for name in ("info", "plot"))):
         assert survey_options_of(parser(command[0]).parse_args([*command, *given])) == want
 
     found = []
