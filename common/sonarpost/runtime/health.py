@@ -8,15 +8,13 @@ import shutil
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from sonarpost.config import PlatformConfig
 from sonarpost.delivery.disk_reserve import DiskReserve
 from sonarpost.delivery.inbox import Inbox
 from sonarpost.delivery.outbox import Outbox
-from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.errors import DeliveryError
 from sonarpost.logs import IntervalLog, kv
@@ -24,6 +22,9 @@ from sonarpost.messages import Health, ServiceState
 from sonarpost.monitoring.heartbeat import Heartbeat
 from sonarpost.monitoring.service_manager import ServiceManager
 from sonarpost.security.tls_files import TlsMonitor
+
+if TYPE_CHECKING:
+    from sonarpost.runtime.service import Service
 
 log = logging.getLogger(__name__)
 
@@ -39,19 +40,6 @@ def disk_gauges(folder: Path) -> dict[str, float]:
         return {}
 
 
-class HealthSource(Protocol):
-    """What a service adds to its health record; see `Service`."""
-
-    def gauges(self) -> Mapping[str, float]:
-        """Return current values."""
-
-    def degraded_reason(self) -> str:
-        """Return why the service cannot work; empty if it can."""
-
-    def warning(self) -> str:
-        """Return a warning; empty for none."""
-
-
 class ServiceHealth:
     """Collects the health of one service and reports it to the supervisor. Safe for several threads.
 
@@ -61,29 +49,17 @@ class ServiceHealth:
         outbox: The outbox, None before the session opens.
 
     Args:
-        platform: The platform.
-        name: Name of the service.
-        store: Its store.
+        service: The service; its hooks add gauges, warnings and why it is degraded.
         disk_reserve: Its disk reserve.
         tls: Its TLS files.
-        source: What the service adds.
     """
 
-    def __init__(
-        self,
-        platform: PlatformConfig,
-        name: str,
-        store: Store,
-        disk_reserve: DiskReserve,
-        tls: TlsMonitor,
-        source: HealthSource,
-    ) -> None:
-        self._platform = platform
-        self._name = name
-        self._store = store
+    def __init__(self, service: Service[Any], disk_reserve: DiskReserve, tls: TlsMonitor) -> None:
+        self._service = service
+        self._platform = platform = service.platform
+        self._store = service.store
         self._disk_reserve = disk_reserve
         self._tls = tls
-        self._source = source
         self.started_utc_s = time.time()
         self.router_failure = ""
         self.inbox: Inbox[Any] | None = None
@@ -141,7 +117,7 @@ class ServiceHealth:
         detail = self._detail(now_utc_s)
         restored = "" if self.outbox is None else self.outbox.warning()
         router = f"router not reached: {self.router_failure}" if self.router_failure else ""
-        warnings = (self._source.warning(), router, restored, self._tls.warning(now_utc_s))
+        warnings = (self._service.warning(), router, restored, self._tls.warning(now_utc_s))
         with self._lock:
             counters = dict(self._counters)
         if discarded := self._discarded_count():
@@ -152,11 +128,11 @@ class ServiceHealth:
             "refused": float(self._store.refused_count()),
             **disk_gauges(self._platform.state_dir),
             **self._tls.gauges(now_utc_s),
-            **self._source.gauges(),
+            **self._service.gauges(),
         }
         return Health(
             platform_id=self._platform.id,
-            service=self._name,
+            service=self._service.NAME,
             time_utc_s=time.time(),
             started_utc_s=self.started_utc_s,
             state=state or ("degraded" if detail else "ok"),
@@ -170,11 +146,11 @@ class ServiceHealth:
         detail = self._degraded
         if self.inbox is not None and self.inbox.storage_failing:
             # With the cause, for example a database that is not reached.
-            detail = detail or "; ".join(filter(None, ("records cannot be stored", self._source.degraded_reason())))
+            detail = detail or "; ".join(filter(None, ("records cannot be stored", self._service.degraded_reason())))
         return (
             detail
             or self._disk_reserve.degraded_reason()
-            or self._source.degraded_reason()
+            or self._service.degraded_reason()
             or self._lost_records()
             or self._discarded_states()
             or self._tls.degraded_reason(now_utc_s)

@@ -9,23 +9,25 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
-from typing import ClassVar, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import zenoh
 
 from sonarpost import keys, wire
 from sonarpost.delivery.inbox import Handle
 from sonarpost.delivery.records import InboxItem
-from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction, UnitOfWork
 from sonarpost.errors import BadInputError, DeliveryError, can_concern_record
 from sonarpost.limits import limit
 from sonarpost.logs import IntervalLog, kv, log_context
 from sonarpost.messages import Record
 from sonarpost.runtime.health import ServiceHealth
+
+if TYPE_CHECKING:
+    from sonarpost.runtime.service import Service
 
 log = logging.getLogger(__name__)
 
@@ -49,52 +51,19 @@ class ServiceStoppingError(Exception):
     """Raised by `Service.handle` when the service stops before the record is handled; it stays in the inbox."""
 
 
-class HandlingService(Protocol):
-    """What the handler calls of a service; see `Service`."""
-
-    BATCH: ClassVar[int]
-    BATCH_BYTES: ClassVar[int]
-    MAX_AT_ONCE: ClassVar[int]
-
-    def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """Return the consumed key expressions with their record types."""
-
-    def validate(self, key: str, record: Record) -> Record | None:
-        """Check a record before it is accepted."""
-
-    def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Handle one record."""
-
-    def handling(self, *, wait: bool = True) -> AbstractContextManager[bool]:
-        """Hold the lock under which records are handled and committed."""
-
-    def before_commit(self) -> None:
-        """Do what has to precede the commit."""
-
-    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
-        """Commit effects and remove their records."""
-
-    def after_commit(self, handled: Sequence[UnitOfWork], superseded: int) -> None:
-        """Do what follows the commit."""
-
-
 class RecordHandler:
     """Checks, accepts and handles the records of one service.
 
     Args:
-        service: The service.
-        store: Its store.
+        service: The service; its hooks check and handle the records.
         health: Its health: refused and quarantined records are counted, failing ones make it degraded.
-        stopping: Set when the service stops.
     """
 
-    def __init__(
-        self, service: HandlingService, store: Store, health: ServiceHealth, stopping: threading.Event
-    ) -> None:
+    def __init__(self, service: Service[Any], health: ServiceHealth) -> None:
         self._service = service
-        self._store = store
+        self._store = service.store
         self._health = health
-        self._stopping = stopping
+        self._stopping = service.stopping
         self._lock = threading.Lock()
         self._record_type = lru_cache(TYPES_KEPT)(self._find_record_type)
         self._decoded: dict[tuple[str, bytes], Record] = {}  # accepted records that are not handled yet

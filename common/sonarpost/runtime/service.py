@@ -73,8 +73,8 @@ class Service(ABC, Generic[C]):
         tls = TlsMonitor(platform.tls)
         self.store = Store(platform.state_dir / f"{self.NAME}.db", page_bytes=self.PAGE_BYTES)
         self._disk_reserve = DiskReserve(self.store, HANDLING_RESERVE_BYTES, "senders keep their records")
-        self._health = ServiceHealth(platform, self.NAME, self.store, self._disk_reserve, tls, self)
-        self._handler = RecordHandler(self, self.store, self._health, self.stopping)
+        self._health = ServiceHealth(self, self._disk_reserve, tls)
+        self._handler = RecordHandler(self, self._health)
         self._session: zenoh.Session | None = None
         self._inbox: Inbox[Record] | None = None
         self._outbox: Outbox | None = None
