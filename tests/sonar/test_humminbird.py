@@ -126,18 +126,6 @@ def test_pings_after_the_clock_was_set_back_are_read(recording):
     assert any("time goes back in 1 of 20 pings, the first in row 10" in text for text in survey.warnings)
 
 
-def test_end_inside_the_last_ping_of_both_files(recording):
-    path, port, starboard = recording
-    for side, lost in ((port, 1), (starboard, 60)):
-        side.write_bytes(side.read_bytes()[:-lost])
-    survey = read_survey(path)
-    assert [len(ping.channels) for ping in survey] == [2, 2, 2, 2]
-    ends = [text for text in survey.warnings if text.startswith("the file ends inside its last ping of")]
-    assert [text[:46] for text in ends] == [
-        f"the file ends inside its last ping of {name}" for name in (port.name, starboard.name)
-    ]
-
-
 def test_invalid_dat_file_is_rejected(recording):
     path, *_ = recording
     for dat in (b"", bytes(64), b"\xc1" + bytes(63), b"\xc1" * 70_000):

@@ -223,15 +223,6 @@ def test_file_without_side_scan_is_refused_with_its_messages(tmp_path):
     assert sum("not side-scan" in w for w in survey.warnings) == 2
 
 
-def test_cut_last_message_is_left_out(tmp_path):
-    whole = [jsf_message(number, 20, side, ENVELOPE) for number in range(3) for side in (0, 1)]
-    path = recording(tmp_path, *whole)
-    path.write_bytes(path.read_bytes()[:-3])
-    survey = read_survey(path)
-    assert [len(p.channels) for p in survey] == [2, 2, 1]
-    assert survey.warnings[0].startswith("the file ends inside its last message")
-
-
 @pytest.mark.parametrize(
     ("offset", "raw", "note"),
     [

@@ -29,7 +29,6 @@ CHANNEL = HEADER + 256
 CHANNEL_BYTES = 64 + 40
 WEIGHT, TIME_DELAY = 58, 12
 ALTITUDE = XTFPingHeader.SensorPrimaryAltitude.offset
-CUT = "the file ends inside its last packet, as after a power failure: {} bytes are left out"
 
 
 @pytest.fixture
@@ -49,24 +48,6 @@ def put(raw, offset, fmt, *values):
     return raw
 
 
-def test_cut_after_the_first_packet_leaves_the_complete_pings_and_before_is_an_error(tmp_path, raw):
-    assert len(raw) == HEADER + 5 * PACKET
-    for length, field in ((0, "file size"), (1, "file size"), (HEADER - 1, "file size"), (HEADER, "pings")):
-        with pytest.raises(SurveyFileError, match=field):
-            read(tmp_path, raw[:length])
-    for length in range(HEADER + 1, HEADER + PACKET, 15):
-        with pytest.raises(SurveyFileError, match=r"pings: got '0; the file ends inside its last packet"):
-            read(tmp_path, raw[:length])
-    complete = read(tmp_path, raw)
-    assert complete.warnings == ()
-    boundaries = (HEADER + row * PACKET + off for row in range(1, 5) for off in (0, 1, 13, 14, 15, 255, 256, 257, 511))
-    for length in boundaries:
-        count, left_bytes = divmod(length - HEADER, PACKET)
-        survey = read(tmp_path, raw[:length])
-        assert [p.number for p in survey] == [p.number for p in complete][:count]
-        assert survey.warnings == ((CUT.format(left_bytes),) if left_bytes else ())
-
-
 def test_damage_is_named_with_its_place_and_the_other_pings_are_read(tmp_path, raw):
     complete = [ping.number for ping in read(tmp_path, raw)]
     for row in range(5):
@@ -83,16 +64,6 @@ def test_damage_is_named_with_its_place_and_the_other_pings_are_read(tmp_path, r
         assert f"packet at byte {first} is left out: ping {complete[row]}, date and time" in survey.warnings[0]
     survey = read(tmp_path, raw + bytes(PACKET // 2))
     assert survey.warnings == ("the file ends with 256 zero bytes, as after a power failure",)
-
-
-def test_cut_of_other_packets_and_of_longer_ones(tmp_path, raw):
-    packet = attitude((2013, 9, 10, 21, 13, 8, 100), 1.5, -2.5, 123.0)
-    for length in range(1, len(packet), 6):
-        survey = read(tmp_path, raw + packet[:length])
-        assert (len(survey.pings), survey.warnings) == (5, (CUT.format(length),))
-    body = bytes(raw[: HEADER + PACKET]) + packet + bytes(raw[HEADER + PACKET :])
-    assert len(read(tmp_path, body[: HEADER + PACKET + 100]).pings) == 1
-    assert len(read(tmp_path, body[:-1]).pings) == 4
 
 
 def with_samples(survey, *pings):
