@@ -39,8 +39,7 @@ def try_every_codec() -> str:
     image = np.random.default_rng(1).gamma(4.0, 25.0, size=(80, 140)).clip(0, 255).astype(np.uint8)
     for snippet in (image, image.astype(np.uint16) * 257):
         for name in codec_names():
-            # The comparison codecs do not reach small budgets; the length of vq streams is fixed.
-            stream = encode(snippet, name, None if name == "vq" else 2048)
+            stream = encode(snippet, name, None if name == "vq" else 2048)  # the length of vq streams is fixed
             pixels = decode(stream)
             assert pixels.shape == image.shape, name
             if name in COMPILE_S:

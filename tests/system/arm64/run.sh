@@ -94,4 +94,4 @@ echo "encode and decode: the same files as on $(uname -m)"
 # The driver, without ports and on pseudo-terminals.
 "${pytest[@]}" tests/modem tests/extensions/simulation/modem/test_emulator.py tests/runtime/test_serial_modem.py
 # The test left out starts a Python of its own, which the emulator does not see.
-"${pytest[@]}" -k "golden and not generic_processor" tests/codec
+"${pytest[@]}" -k "golden and not generic_processor" tests/codec tests/research/baselines
