@@ -73,7 +73,6 @@ READS = {
 }
 QUEUES = {
     "common/sonarpost/bus/catch_up.py": "MAX_BUFFERED; c2 is queried again after an overflow",
-    "common/sonarpost/cli/c2/watch.py": "MAX_WAITING of each vessel",
     "common/sonarpost/cli/deployment/modem_ping.py": "a command for a modem at this computer; it ends after its pings",
     "common/sonarpost/delivery/queue_sender.py": "queries that have ended, at most WINDOW",
     "common/sonarpost/delivery/scheduler.py": "records of the store, at most `lookahead`",

@@ -10,8 +10,6 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 from typing_extensions import override
 
-from sonarpost.archive.postgresql import DatabaseAddress
-from sonarpost.archive.reader import ArchivePlace
 from sonarpost.config import ConsumerName, PlatformConfig
 from sonarpost.errors import ConfigError
 from sonarpost.keys import SHORE
@@ -46,9 +44,6 @@ class ConsoleConfig(RetentionConfig):
         decision_consumers: On a vessel: services to which decisions are sent.
         command_consumers: On a vessel: services to which requests are sent.
         vehicles: Vehicle name for each modem address, as in `[op_modem]`.
-        out_dir: At a shore site: folder of c2, read at the start for records accepted in the meantime.
-        database: At a shore site: database of c2 in place of `out_dir`, as in `[c2]`.
-        database_password_file: File with its password, as in `[c2]`.
         downlink_rate: Rate of the vessel, as in `[op_modem]`, for cost estimates; by default the downlink rate of the
             driver in `[modem]`.
         assumed_rate: Rate of vehicles before their first frame; for cost estimates.
@@ -85,9 +80,6 @@ class ConsoleConfig(RetentionConfig):
     decision_consumers: tuple[ConsumerName, ...] = ("relay", "op_modem")
     command_consumers: tuple[ConsumerName, ...] = ("op_modem",)
     vehicles: dict[Annotated[str, Field(pattern=r"^[0-9]{1,3}$")], PlatformId] = Field(default_factory=dict)
-    out_dir: Path | None = None
-    database: str | None = None
-    database_password_file: Path | None = None
     downlink_rate: Annotated[int, Field(ge=0, le=MAX_RATE)] | None = None
     assumed_rate: Annotated[int, Field(ge=0, le=MAX_RATE)] | None = None
     group_radius_m: Annotated[float, Field(gt=0, le=1000)] = 8.0
@@ -126,30 +118,18 @@ class ConsoleConfig(RetentionConfig):
             raise ValueError("vessel_lat_deg and vessel_lon_deg together")
         return self
 
-    def archive(self) -> ArchivePlace | None:
-        """Return the database or folder of c2; None for none.
-
-        Raises:
-            ConfigError: The address of the database is invalid, or its password cannot be read.
-        """
-        if self.database is None:
-            return self.out_dir
-        return DatabaseAddress.parse(self.database, self.database_password_file, "console")
-
     @override
     def check_with(self, platform: PlatformConfig) -> None:
         """Check that the web server is installed, and that there is a certificate for `tls`.
 
         Raises:
-            ConfigError: The extra `console` is not installed, `tls` is set and the platform has no certificate, or the
-                address of the database is invalid.
+            ConfigError: The extra `console` is not installed, or `tls` is set and the platform has no certificate.
         """
         if importlib.util.find_spec("uvicorn") is None:
             expected = "the extra console: pip install 'sonarpost[console]'; or a file without this table"
             raise ConfigError("[console]", "", "no web server installed", expected)
         if self.tls and platform.tls is None:
             raise ConfigError("[console]", "tls", "true", "a certificate in [platform] tls")
-        self.archive()
 
     def class_groups(self) -> dict[str, list[str]]:
         """Return the proposed classes by group, as decisions state them: `MILCO > manta`. A list has the group ""."""

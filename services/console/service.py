@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import islice
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
 import zenoh
 from typing_extensions import override
 
 from sonarpost import keys, wire
-from sonarpost.archive.image_files import stored_image
-from sonarpost.archive.reader import ArchivePlace, archive_parts
+from sonarpost.bus.catch_up import CatchUpSubscriber
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
-from sonarpost.errors import BadInputError, DeliveryError, PayloadError
-from sonarpost.export.contacts import MAX_FILE_BYTES, read_stored_records
-from sonarpost.files import read_regular
+from sonarpost.errors import BadInputError, DeliveryError, PayloadError, QueryRefusedError
 from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import (
     AcousticFrame,
@@ -52,7 +48,6 @@ from sonarpost.services.console.store.database import (
 )
 from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.web.server import ConsoleApp, WebServer
-from sonarpost.sonar.image_files import read_image
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +58,14 @@ C2 = "c2"
 OP_MODEM = "op_modem"
 UPDATE_INTERVAL_S = 1.0
 TOKENS_TIMEOUT_S = 1.0
-CATCH_UP_BATCH = 50
+BATCH_RECORDS = 50
+SHORE_RECORDS: Mapping[str, type[ReconstructedImage] | type[Decision]] = {
+    "image": ReconstructedImage,
+    "decision": Decision,
+}
+"""Records of c2 that are stored, by the last part of their key."""
+_CURSOR = "cursor"
+"""Name of the store's state entry: position in the records of c2."""
 SHORE_DELIVERY_MARGIN_S = 2.0
 """Age that a decision must have before the relay's health proves its delivery: health is older than its arrival."""
 _ACKNOWLEDGED = "acknowledged/"
@@ -118,36 +120,26 @@ class ConsoleService(Service[ConsoleConfig]):
         return self.config.role == "vessel"
 
     @override
+    @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """On a vessel: its images and comments. At a shore site: images and decisions published by c2."""
-        if self._on_vessel:
-            vessel = self.platform.id
-            return {keys.image_reconstructed(vessel): ReconstructedImage, keys.comment(vessel): Comment}
-        site = self.config.site
-        return {keys.shore_image_all(site): ReconstructedImage, keys.shore_decision_all(site): Decision}
+        if not self._on_vessel:
+            return {}  # what c2 accepts is read by `_follow_c2`
+        vessel = self.platform.id
+        return {keys.image_reconstructed(vessel): ReconstructedImage, keys.comment(vessel): Comment}
 
     @override
     def validate(self, key: str, record: Record) -> None:
-        """Refuse a record of another vessel."""
-        if self._on_vessel and isinstance(record, (ReconstructedImage, Comment)):
-            if record.vessel_id != self.platform.id:
-                raise PayloadError(key, "vessel_id", record.vessel_id, self.platform.id)
-        elif isinstance(record, (ReconstructedImage, Decision)):
-            site = self.config.site
-            expected = (keys.shore_image(record.vessel_id, site), keys.shore_decision(record.vessel_id, site))
-            if key not in expected:
-                raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
+        assert isinstance(record, (ReconstructedImage, Comment))
+        if record.vessel_id != self.platform.id:
+            raise PayloadError(key, "vessel_id", record.vessel_id, self.platform.id)
 
     @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
-        """Store a record. A repeated record changes nothing."""
         if isinstance(record, ReconstructedImage):
             is_new = self.state.store_image(record)
             effects.count("images_taken" if is_new else "images_repeated")
             if is_new and record.version == 1 and self._watch is not None:
                 self._watch.contact_arrived(record, time.monotonic())
-        elif isinstance(record, Decision):
-            effects.count("decisions_taken" if self.state.store_decision(record) else "decisions_repeated")
         else:
             assert isinstance(record, Comment)
             self.state.store_comment(record)
@@ -244,8 +236,6 @@ class ConsoleService(Service[ConsoleConfig]):
         self.start_thread(self._retention.run, "retention")
         if self._watch is not None:
             self._watch.start()
-        if not self._on_vessel and self.config.archive() is not None:
-            self.start_thread(self._catch_up, "catch-up")
 
     @override
     def on_start(self) -> None:
@@ -261,6 +251,7 @@ class ConsoleService(Service[ConsoleConfig]):
         else:
             self._subscribe(keys.tasking_state_all(self.config.site), TaskingState, self.state.apply_tasking_state)
             self._subscribe(keys.shore_status_all(self.config.site), ReceivedStatus, self.state.store_status)
+            self.start_thread(self._follow_c2, "c2")
         # A shore site subscribes to its own health only: the health of all vessels would load their radio links.
         health = keys.health_everywhere() if self._on_vessel else keys.health_all(self.platform.id)
         self.session.declare_subscriber(health, self._on_health)
@@ -355,35 +346,71 @@ class ConsoleService(Service[ConsoleConfig]):
         # The own token is one of them, unless the router did not reply.
         return tokens or None
 
-    def _catch_up(self) -> None:
-        """Store the records that c2 accepted while the console was stopped."""
-        place = self.config.archive()
-        assert place is not None
-        records = stored_records(place)
-        try:
-            while not self.stopping.is_set() and (batch := list(islice(records, CATCH_UP_BATCH))):
-                self.count("records_caught_up", self._store_batch(batch))
-        except DeliveryError as error:
-            log.error("Records of c2 not stored, trying again at the next start", extra=kv(reason=str(error)))
+    def _follow_c2(self) -> None:
+        """Store the images and decisions that c2 accepts, first those since the last start."""
+        key = keys.shore_contact_all(self.config.site)
+        cursor = self.store.states(_CURSOR).get("", b"").decode()
+        while not self.stopping.is_set():
+            with CatchUpSubscriber(self.session, key, cursor) as records:
+                try:
+                    while not self.stopping.is_set():
+                        self._store_batch(self._next_batch(records))
+                        if records.cursor != cursor:
+                            cursor = records.cursor
+                            with self.store.transaction() as tx:
+                                tx.put_state(_CURSOR, cursor.encode())
+                except (DeliveryError, QueryRefusedError) as error:
+                    self._not_stored_log.log(reason=str(error)[:300])
+            self.stopping.wait(UPDATE_INTERVAL_S)
 
-    def _store_batch(self, batch: Sequence[ReconstructedImage | Decision]) -> int:
-        """Store records in halves down to one that fails, which is left out; return how many are new.
+    def _next_batch(self, records: CatchUpSubscriber) -> list[ReconstructedImage | Decision]:
+        """Return the records that are there; an empty list after a second without any."""
+        batch: list[ReconstructedImage | Decision] = []
+        timeout_s = UPDATE_INTERVAL_S
+        while len(batch) < BATCH_RECORDS and (found := records.poll(timeout_s)) is not None:
+            timeout_s = 0.0
+            *_, vessel, kind = found.key.split("/")
+            if kind not in SHORE_RECORDS:
+                continue
+            try:
+                record = wire.decode(SHORE_RECORDS[kind], found.payload, found.key)
+                if record.vessel_id != vessel:
+                    raise PayloadError(found.key, "vessel_id", record.vessel_id, vessel)
+            except BadInputError as error:
+                self.count("records_ignored")
+                self._ignored_log.log(key=found.key, reason=str(error)[:300])
+            else:
+                batch.append(record)
+        return batch
+
+    def _store_batch(self, batch: Sequence[ReconstructedImage | Decision]) -> None:
+        """Store records in halves down to one that fails, which is left out.
 
         Raises:
             DeliveryError: The database cannot be written.
         """
+        images = [record for record in batch if isinstance(record, ReconstructedImage)]
         try:
-            new = self.state.store_images([record for record in batch if isinstance(record, ReconstructedImage)])
-            return new + sum(self.state.store_decision(record) for record in batch if isinstance(record, Decision))
+            new = self.state.store_images(images)
+            stored = [self.state.store_decision(record) for record in batch if isinstance(record, Decision)]
         except DeliveryError:
             raise
         except Exception as error:  # noqa: BLE001  concerns one of the records
             if len(batch) == 1:
                 self.count("records_ignored")
                 self._ignored_log.log(error, key=batch[0].TYPE, reason=str(error)[:300])
-                return 0
+                return
             half = len(batch) // 2
-            return self._store_batch(batch[:half]) + self._store_batch(batch[half:])
+            self._store_batch(batch[:half])
+            self._store_batch(batch[half:])
+        else:
+            for name, number in (
+                ("images_taken", new),
+                ("images_repeated", len(images) - new),
+                ("decisions_taken", sum(stored)),
+                ("decisions_repeated", len(stored) - sum(stored)),
+            ):
+                self.count(name, number)
 
     # Stop and health
 
@@ -449,26 +476,3 @@ def _table_and_id(item: OutboxItem) -> tuple[Table, str]:
         if item.encoding == wire.encoding_of(record_type)
     )
     return table, str(getattr(wire.decode(record_type, item.payload, item.key), ID_COLUMN[table]))
-
-
-def stored_records(place: ArchivePlace) -> Iterator[ReconstructedImage | Decision]:
-    """Yield the images and decisions in the archive of c2, images first. Invalid files are logged and skipped.
-
-    Args:
-        place: Folder or database of c2.
-    """
-    try:
-        for folder in archive_parts(place):
-            stored = read_stored_records(folder)
-            for problem in stored.problems:
-                log.warning("Stored file skipped", extra=kv(reason=str(problem)))
-            for _, path in stored.images:
-                try:
-                    yield stored_image(
-                        read_regular(path, MAX_FILE_BYTES), read_image(path.with_suffix(".tiff")), str(path)
-                    )
-                except (BadInputError, OSError) as error:
-                    log.warning("Stored image skipped", extra=kv(file=path, reason=str(error)))
-            yield from stored.decisions
-    except BadInputError as error:
-        log.error("Archive of c2 not readable", extra=kv(reason=str(error)))

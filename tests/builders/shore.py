@@ -11,7 +11,7 @@ from builders.records import reconstructed_image
 from sonarpost import keys, wire
 from sonarpost.bus.catch_up import AcceptedRecord, CatchUpSubscriber
 from sonarpost.errors import BadInputError, QueryRefusedError
-from sonarpost.messages import Decision, Pixels, ReconstructedImage, Relayed
+from sonarpost.messages import Decision, Pixels, ReconstructedImage, Record, Relayed, TaskingState
 
 CONTACTS = "sonarpost/v1/shore/contact/*/*"
 
@@ -38,6 +38,58 @@ def identity(payload: bytes) -> str:
     """Return the identifier of a decision, or of an image."""
     fields = msgpack.unpackb(payload)
     return str(fields.get("decision_id", fields["image_id"]))
+
+
+class Site:
+    """Numbers records, publishes them and answers queries, as c2 does. It has no files.
+
+    Args:
+        session: A session at the router of the site.
+        records: Records that were accepted before.
+        archive: Identity of the archive.
+    """
+
+    def __init__(self, session: zenoh.Session, *records: Record, archive: str = "0000000a") -> None:
+        self._session = session
+        self._archive = archive
+        self._accepted: list[tuple[str, bytes]] = []
+        self.accept(*records, publish=False)
+        for key in (keys.shore_contact_all(), keys.tasking_state_all()):
+            session.declare_queryable(key, self._answer, complete=True)
+
+    def accept(self, *records: Record, publish: bool = True) -> None:
+        """Accept images, decisions and tasking states; `publish` is false for a publication that is lost."""
+        for record in records:
+            key = {
+                ReconstructedImage: keys.shore_image,
+                Decision: keys.shore_decision,
+                TaskingState: keys.tasking_state,
+            }[type(record)](record.vessel_id)
+            accepted = {"archive": self._archive, "seq": len(self._accepted) + 1, "utc_s": 1.0}
+            payload = msgpack.packb({**wire.map_of(record), "accepted": accepted}, use_bin_type=True)
+            self._accepted.append((key, payload))
+            if publish:
+                self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        parameters = dict(pair.split("=", 1) for pair in str(query.parameters).split(";"))
+        archive, _, after = parameters.get("after", "").partition(".")
+        if archive not in ("", self._archive):
+            query.reply_err(f"{query.key_expr}: after: got {archive}".encode(), encoding=zenoh.Encoding.TEXT_PLAIN)
+        else:
+            found = [
+                (number, key, payload)
+                for number, (key, payload) in enumerate(self._accepted, 1)
+                if number > int(after or 0) and query.key_expr.intersects(zenoh.KeyExpr(key))
+            ]
+            sent = [] if "_time" in parameters else found[: int(parameters["limit"])]
+            for _, key, payload in sent:
+                query.reply(key, payload)
+            more = bool(sent) and len(sent) < len(found)
+            end = sent[-1][0] if more else len(self._accepted)
+            page = {"type": "page", "v": 1, "records": len(sent), "unreadable": 0, "more": more}
+            query.reply(query.key_expr, msgpack.packb({**page, "next": f"{self._archive}.{end}"}))
+        query.drop()
 
 
 class Reader:

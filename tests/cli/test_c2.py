@@ -10,6 +10,7 @@ import pytest
 import zenoh
 from builders.common import eventually, free_port, publish_once
 from builders.records import decision_record, reconstructed_image
+from builders.shore import Site
 from builders.store_steps import queued_items
 
 from sonarpost import keys, wire
@@ -251,22 +252,25 @@ def test_watch_prints_lines_across_router_restarts_until_ctrl_c():
     hub = zenoh.open(router_config([endpoint]))
     printed, errors = [], []
     command = [sys.executable, "-um", "sonarpost.cli.main", "c2", "watch", "--router", endpoint]
+    site = Site(hub, image("0000"))
 
-    def publish(record, key):
-        publish_once(hub, key, wire.encode(record))
+    def first_record_is_printed():
+        site.accept(image())
+        return bool(printed)
 
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         for stream, lines in ((process.stdout, printed), (process.stderr, errors)):
             threading.Thread(target=lambda s=stream, to=lines: to.extend(iter(s.readline, "")), daemon=True).start()
         try:
             eventually(lambda: any("watching shore" in line for line in errors))
+            eventually(first_record_is_printed)
             publish_once(hub, keys.shore_image("vessel-1"), b"rubbish")
-            eventually(lambda: any("expected" in line for line in errors))
-            publish(image(), keys.shore_image("vessel-1"))
-            publish(decision(remark="two\nlines \x1b[31m"), keys.shore_decision("vessel-1"))
+            eventually(lambda: any("Invalid record ignored" in line for line in errors))
+            site.accept(decision(remark="two\nlines \x1b[31m"))
             state = {"kind": "comment", "record_id": "a", "state": "refused", "reason": "no", "changed_utc_s": 1}
-            publish(TaskingState(vessel_id="vessel-1", **state), keys.tasking_state("vessel-1"))
-            eventually(lambda: len(printed) == 3)
+            site.accept(TaskingState(vessel_id="vessel-1", **state))
+            eventually(lambda: all(kind in "".join(printed) for kind in ("decision", "comment")))
+            assert "uuv-1/0000" not in "".join(printed)  # accepted before
             assert "vessel-1  image     uuv-1/AAAA v1  30 × 20 px, complete, at 56.40000 -5.60000" in "".join(printed)
             assert "decision  uuv-1/AAAA v1  mine_like two?lines ?[31m (op)\n" in "".join(printed)
             assert "comment   a  refused: no\n" in "".join(printed)
@@ -274,8 +278,10 @@ def test_watch_prints_lines_across_router_restarts_until_ctrl_c():
             eventually(lambda: any("router not reached" in line for line in errors))
             hub = zenoh.open(router_config([endpoint]))
             eventually(lambda: any("router reconnected" in line for line in errors))
-            publish(image("ZZZZ"), keys.shore_image("vessel-1"))
-            eventually(lambda: len(printed) > 3)
+            number = len(site._accepted)
+            site = Site(hub, *[image()] * number)
+            site.accept(image("ZZZZ"))
+            eventually(lambda: any("uuv-1/ZZZZ" in line for line in printed))
             process.send_signal(signal.SIGINT)
             assert process.wait() == 0
             assert not any("Traceback" in line for line in errors)

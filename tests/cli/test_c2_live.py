@@ -1,51 +1,25 @@
 """Live contacts of a site, for commands that pass them on."""
 
-from types import SimpleNamespace
-
 import zenoh
-from builders.common import eventually, free_port, publish_once
-from builders.exports import decision, image, store
+from builders.common import eventually, free_port
+from builders.exports import decision, image
+from builders.shore import Site
 
 from sonarpost import keys, wire
+from sonarpost.bus.catch_up import CatchUpSubscriber
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.cli.c2 import live as live_module
-from sonarpost.cli.c2 import watch as watch_module
 from sonarpost.cli.c2.live import ContactStream
 from sonarpost.export.live import LiveContacts
+from sonarpost.review.rendering import encode_png
 
 
-class PublishedRecords:
-    """A session whose only subscriber receives the given records."""
-
-    def __init__(self):
-        self.info = SimpleNamespace(routers_zid=lambda: ["router"])
-        self.publish = None
-
-    def declare_subscriber(self, key, on_sample):
-        self.publish = on_sample
-
-
-def test_vessels_have_places_and_turns_of_their_own(monkeypatch):
-    monkeypatch.setattr(watch_module, "MAX_WAITING", 10)
-    session = PublishedRecords()
-    watch = watch_module.RecordSubscription(session, keys.SHORE, None)
-    for vessel, count in (("vessel-2", 50), ("vessel-1", 3)):
-        for number in range(count):
-            record = decision(f"{number:04d}", vessel_id=vessel)
-            payload = SimpleNamespace(to_bytes=lambda record=record: wire.encode(record))
-            session.publish(
-                SimpleNamespace(kind=zenoh.SampleKind.PUT, key_expr=keys.shore_decision(vessel), payload=payload)
-            )
-    assert watch.gaps == 40
-    order = [watch.poll().vessel_id for _ in range(13)]
-    assert order[:6].count("vessel-1") == 3
-    assert watch.poll() is None
-
-
-def test_stream_reads_the_folder_first_and_after_an_interruption(tmp_path):
+def test_stream_has_the_stored_contacts_and_those_missed_in_an_interruption(monkeypatch):
+    monkeypatch.setattr("sonarpost.bus.catch_up.RETRY_S", 0.1)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     hub = zenoh.open(router_config([endpoint]))
-    folder = store(tmp_path / "out", image("0001"), image("0002", vessel_id="vessel-2"))
+    records = [image("0001"), image("0002", vessel_id="vessel-2")]
+    site = Site(hub, *records)
     session = zenoh.open(client_config([endpoint]))
     changes = []
 
@@ -54,23 +28,31 @@ def test_stream_reads_the_folder_first_and_after_an_interruption(tmp_path):
         return [change.contact.image.image_id for change in changes]
 
     try:
-        stream = ContactStream(session, keys.SHORE, "vessel-1", folder)
+        stream = ContactStream(session, keys.SHORE, "vessel-1", stored=True)
         eventually(lambda: poll() == ["0001"])
-        assert changes[0].png == (folder / "vessel-1").glob("*.png").__next__().read_bytes()
-        publish_once(hub, keys.shore_image("vessel-1"), wire.encode(image("0001", version=2)))
-        eventually(lambda: poll() == ["0001", "0001"])
-        publish_once(hub, keys.shore_decision("vessel-1"), wire.encode(decision("0001")))
-        eventually(lambda: poll() == ["0001", "0001", "0001"])
-        assert changes[2].contact.review == "mine_like"
-        assert changes[2].png is None
+        assert changes[0].png == encode_png(image("0001").pixels.to_array())
+        records += [image("0001", version=2), decision("0001")]
+        site.accept(*records[2:])
+        eventually(lambda: poll() == ["0001"] * 3)
+        assert (changes[2].contact.review, changes[2].png) == ("mine_like", None)
         hub.close()
-        store(folder, image("0003"))  # accepted while this program was not connected
         eventually(lambda: poll() == ["0001"] * 3 and not session.info.routers_zid())
+        stream._records._refresh_s = 0.2
         hub = zenoh.open(router_config([endpoint]))
+        Site(hub, *records, image("0003"))  # accepted while this program was not connected
         eventually(lambda: poll() == ["0001"] * 3 + ["0003"])
     finally:
         session.close()
         hub.close()
+
+
+def test_stream_without_stored_contacts_begins_with_the_next(client, router):
+    site = Site(client, image("0001"))
+    with zenoh.open(client_config([router])) as session:
+        stream = ContactStream(session, keys.SHORE, None, stored=False)
+        eventually(lambda: stream.poll() == [] and stream._records.is_caught_up)
+        site.accept(image("0002"))
+        eventually(lambda: [change.contact.image.image_id for change in stream.poll()] == ["0002"])
 
 
 def test_live_contacts_have_places_by_vessel():
@@ -81,14 +63,34 @@ def test_live_contacts_have_places_by_vessel():
     assert names == [("vessel-1", "0000"), ("vessel-2", "0007"), ("vessel-2", "0008")]
 
 
-def test_contact_that_fails_ends_no_stream(monkeypatch):
-    session = PublishedRecords()
-    stream = ContactStream(session, keys.SHORE, None, None)
+def test_contact_that_fails_ends_no_stream(client, router, monkeypatch):
     png_of = live_module._png_of
     monkeypatch.setattr(live_module, "_png_of", lambda record: 1 / 0 if record.image_id == "0001" else png_of(record))
-    for n in (1, 2):
-        payload = SimpleNamespace(to_bytes=lambda n=n: wire.encode(image(f"{n:04}")))
-        key = keys.shore_image("vessel-1")
-        session.publish(SimpleNamespace(kind=zenoh.SampleKind.PUT, key_expr=key, payload=payload))
-    assert stream.poll() == []
-    assert [change.contact.image.image_id for change in stream.poll()] == ["0002"]
+    Site(client, image("0001"), image("0002"))
+    with zenoh.open(client_config([router])) as session:
+        stream = ContactStream(session, keys.SHORE, None, stored=True)
+        eventually(lambda: [change.contact.image.image_id for change in stream.poll()] == ["0002"])
+
+
+def test_invalid_publications_end_no_subscription(client, router):
+    site = Site(client)
+    with (
+        zenoh.open(client_config([router])) as session,
+        CatchUpSubscriber(session, keys.shore_contact_all()) as records,
+    ):
+        eventually(lambda: records.poll(0.1) is None and records.is_caught_up)
+        client.put(keys.shore_image("vessel-1"), b"rubbish")
+        client.put(keys.shore_image("vessel-1"), wire.encode(image("0001")))  # without a number
+        site.accept(image("0002"))
+        found = []
+        eventually(lambda: found.append(records.poll(0.1)) or found[-1] is not None)
+        assert found[-1].seq == 1
+
+
+def test_new_archive_is_read_from_its_first_record(client, router, monkeypatch):
+    monkeypatch.setattr("sonarpost.bus.catch_up.RETRY_S", 0.05)
+    Site(client, image("0001"), archive="0000000b")
+    with zenoh.open(client_config([router])) as session:
+        records = CatchUpSubscriber(session, keys.shore_contact_all(), "0000000a.7")
+        eventually(lambda: (found := records.poll(0.1)) is not None and found.archive == "0000000b")
+        records.close()

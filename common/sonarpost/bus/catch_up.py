@@ -10,6 +10,7 @@ and needs the unstable part of Zenoh's interface in every client.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections import deque
@@ -22,7 +23,10 @@ import zenoh
 from pydantic import BaseModel, ConfigDict, Field
 
 from sonarpost import wire
-from sonarpost.errors import BadInputError, PayloadError, QueryRefusedError
+from sonarpost.errors import PayloadError, QueryRefusedError
+from sonarpost.logs import IntervalLog, kv
+
+log = logging.getLogger(__name__)
 
 QUERY_TIMEOUT_S: Final = 30.0
 RETRY_S: Final = 1.0
@@ -74,10 +78,10 @@ class _Page(BaseModel):
 
 
 class CatchUpSubscriber:
-    """Iterates over the accepted records of a shore site: first those after `cursor`, then every new one.
+    """Delivers the accepted records of a shore site: first those after `cursor`, then every new one.
 
     Records of a query are in the order of their numbers; a record that is published during the query can come before
-    records with lower numbers. Close it from another thread to end the iteration.
+    records with lower numbers. After the archive of c2 was replaced, the new one is delivered from its first record on.
 
     >>> with CatchUpSubscriber(session, "sonarpost/v1/shore/contact/*/*", saved_cursor) as records:
     ...     for record in records:
@@ -89,6 +93,7 @@ class CatchUpSubscriber:
         key: Key expression of the records, within `sonarpost/v1/{site}/contact/*/*` or that of tasking states.
         cursor: `cursor` of an earlier subscription; empty for all records.
         refresh_s: Interval of the queries for lost publications.
+        only_new: Whether an empty cursor stands for the records that c2 accepts from now on.
 
     Attributes:
         cursor: Every record up to it was delivered; continue here after a restart. A record after it may have been
@@ -96,20 +101,27 @@ class CatchUpSubscriber:
         is_caught_up: Whether the last query was answered and had no further records.
     """
 
-    def __init__(self, session: zenoh.Session, key: str, cursor: str = "", *, refresh_s: float = 30.0) -> None:
+    def __init__(
+        self, session: zenoh.Session, key: str, cursor: str = "", *, refresh_s: float = 30.0, only_new: bool = False
+    ) -> None:
         self.cursor = cursor
         self.is_caught_up = False
         self._session = session
         self._key = key
         self._refresh_s = refresh_s
+        self._only_new = only_new and not cursor
         self._changed = threading.Condition()
         self._buffer: deque[AcceptedRecord] = deque()
         self._overflowed = False
         self._closed = False
-        self._failed: BadInputError | None = None
+        self._query_at_s = time.monotonic()
+        self._found: deque[AcceptedRecord] = deque()
+        self._page: _Page | None = None
+        self._delivered: AcceptedRecord | None = None
         # Numbers after the cursor that were delivered from publications.
         self._ahead: set[int] = set()
         self._limit = MAX_RECORDS
+        self._invalid_log = IntervalLog(log, logging.WARNING, "Invalid record ignored")
         self._subscriber = session.declare_subscriber(key, self._on_sample)
 
     def __enter__(self) -> Self:
@@ -132,43 +144,61 @@ class CatchUpSubscriber:
         self._subscriber.undeclare()
 
     def __iter__(self) -> Iterator[AcceptedRecord]:
-        """Deliver records until `close`.
+        """Deliver records until another thread calls `close`.
 
         Raises:
-            QueryRefusedError: c2 does not accept the key or the cursor, for example after its archive was replaced.
-            BadInputError: A record has no number, or one of another archive.
+            QueryRefusedError: c2 does not accept the key.
         """
-        query_at_s = time.monotonic()
         while not self._closed:
-            if time.monotonic() >= query_at_s or self._overflowed:
-                query_at_s = time.monotonic() + self._refresh_s
-                self._overflowed = False
-                answered = True
-                while answered and not self._closed:
-                    page, records = self._query()
-                    answered = page is not None and page.more
-                    yield from self._of_page(records)
-                    if page is not None:
-                        self._advance(page.next)
-                    else:
-                        query_at_s = time.monotonic() + RETRY_S
-                    self.is_caught_up = page is not None and not page.more
-            record = self._next_published(query_at_s)
-            if record is not None and self._is_new(record):
-                self._ahead.add(record.seq)
+            record = self.poll(self._refresh_s)
+            if record is not None:
                 yield record
 
-    def _of_page(self, records: list[AcceptedRecord]) -> Iterator[AcceptedRecord]:
-        for record in records:
-            if self._is_new(record):
-                yield record
-                self._advance(f"{record.archive}.{record.seq}")
+    def poll(self, timeout_s: float) -> AcceptedRecord | None:
+        """Return the next record; None if there is none for this time, or if c2 has to be queried first.
+
+        Raises:
+            QueryRefusedError: c2 does not accept the key.
+        """
+        self._confirm()
+        if self._page is None and (self._overflowed or time.monotonic() >= self._query_at_s):
+            self._read_page()
+        while self._found:
+            self._delivered = self._found.popleft()
+            if self._is_new(self._delivered):
+                return self._delivered
+            self._confirm()
+        self._confirm()
+        record = self._next_published(min(time.monotonic() + timeout_s, self._query_at_s))
+        if record is None or not self._is_new(record):
+            return None
+        self._ahead.add(record.seq)
+        return record
+
+    def _read_page(self) -> None:
+        self._overflowed = False
+        self._query_at_s = time.monotonic() + self._refresh_s
+        self._page, records = self._query()
+        self._found.extend(records)
+        if self._page is None:
+            self._query_at_s = time.monotonic() + RETRY_S
+            self.is_caught_up = False
+        elif self._page.more:
+            self._query_at_s = time.monotonic()
+
+    def _confirm(self) -> None:
+        """Move the cursor behind the record that was delivered, or behind the page after its last record."""
+        if self._page is not None and not self._found:
+            self._advance(self._page.next)
+            self.is_caught_up = not self._page.more
+            self._page = None
+        elif self._delivered is not None:
+            self._advance(f"{self._delivered.archive}.{self._delivered.seq}")
+        self._delivered = None
 
     def _is_new(self, record: AcceptedRecord) -> bool:
         archive, seq = self._position()
-        if archive and record.archive != archive:
-            raise BadInputError(record.key, "archive", record.archive, f"{archive}, the archive of the cursor")
-        return record.seq > seq and record.seq not in self._ahead
+        return archive in ("", record.archive) and record.seq > seq and record.seq not in self._ahead
 
     def _position(self) -> tuple[str, int]:
         archive, _, seq = self.cursor.partition(".")
@@ -182,25 +212,22 @@ class CatchUpSubscriber:
     def _next_published(self, until_s: float) -> AcceptedRecord | None:
         with self._changed:
             self._changed.wait_for(
-                lambda: self._buffer or self._closed or self._overflowed or self._failed,
-                max(0.0, until_s - time.monotonic()),
+                lambda: self._buffer or self._closed or self._overflowed, max(0.0, until_s - time.monotonic())
             )
-            if self._failed is not None:
-                raise self._failed
             return self._buffer.popleft() if self._buffer and not self._closed else None
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
+        where, payload = str(sample.key_expr), sample.payload.to_bytes()
+        try:
+            record = _accepted_record(where, payload, wire.unpack_map(payload, where))
+        except PayloadError as error:
+            self._invalid_log.log(reason=str(error)[:300])
+            return
         with self._changed:
-            try:
-                where, payload = str(sample.key_expr), sample.payload.to_bytes()
-                record = _accepted_record(where, payload, wire.unpack_map(payload, where))
-            except PayloadError as error:
-                self._failed = error
+            if len(self._buffer) < MAX_BUFFERED:
+                self._buffer.append(record)
             else:
-                if len(self._buffer) < MAX_BUFFERED:
-                    self._buffer.append(record)
-                else:
-                    self._overflowed = True
+                self._overflowed = True
             self._changed.notify_all()
 
     def _query(self) -> tuple[_Page | None, list[AcceptedRecord]]:
@@ -210,7 +237,9 @@ class CatchUpSubscriber:
             QueryRefusedError: c2 does not accept the query.
         """
         after = f";after={self.cursor}" if self.cursor else ""
-        selector = f"{self._key}?limit={self._limit}{after}"
+        # No record is from the future: the page has no records, and the position of the last one.
+        only_new = ";_time=[now(36500d)..]" if self._only_new else ""
+        selector = f"{self._key}?limit={self._limit}{after}{only_new}"
         # By number: if several c2 with one archive reply, each record arrives more than once.
         records: dict[int, AcceptedRecord] = {}
         page: _Page | None = None
@@ -223,21 +252,29 @@ class CatchUpSubscriber:
         for reply in replies:
             if reply.ok is not None:
                 where, payload = str(reply.ok.key_expr), reply.ok.payload.to_bytes()
-                fields = wire.unpack_map(payload, where)
-                if fields.get("type") == "page":
-                    found = wire.validated(_Page, fields, where)
-                    page = found if page is None or page.records < found.records else page
-                else:
-                    record = _accepted_record(where, payload, fields)
-                    records[record.seq] = record
+                try:
+                    fields = wire.unpack_map(payload, where)
+                    if fields.get("type") == "page":
+                        found = wire.validated(_Page, fields, where)
+                        page = found if page is None or page.records < found.records else page
+                    else:
+                        record = _accepted_record(where, payload, fields)
+                        records[record.seq] = record
+                except PayloadError as error:
+                    self._invalid_log.log(reason=str(error)[:300])
             elif reply.err is not None and reply.err.encoding == zenoh.Encoding.TEXT_PLAIN:
                 text = reply.err.payload.to_string()
-                if ": busy: " not in text:
+                if self.cursor and ": after: " in text:
+                    log.warning("Archive of c2 was replaced, reading the new one", extra=kv(reason=text[:300]))
+                    self.cursor = ""
+                    self._ahead.clear()
+                elif ": busy: " not in text:
                     raise QueryRefusedError(text)
         if page is None or page.records != len(records):
             # Replies were lost or took too long: fewer of them may pass.
             self._limit = max(1, (len(records) or self._limit) // 2)
             return None, []
+        self._only_new = False
         return page, [records[seq] for seq in sorted(records)]
 
 

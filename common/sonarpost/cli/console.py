@@ -8,23 +8,27 @@ import secrets
 import sys
 import tempfile
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sonarpost.archive.reader import place_of
+from sonarpost.archive.image_files import stored_image
+from sonarpost.archive.reader import ArchivePlace, as_folder, place_of
 from sonarpost.archive.shore_index import FILE_NAME as FILE_NAME_OF_INDEX
 from sonarpost.cli.parsing.parser import CommandParser
-from sonarpost.cli.shared import flag, option
+from sonarpost.cli.shared import flag, option, print_rejected
 from sonarpost.config import load
-from sonarpost.errors import ConfigError, PortError
+from sonarpost.errors import BadInputError, ConfigError, PortError
+from sonarpost.export.contacts import MAX_FILE_BYTES, read_stored_records
+from sonarpost.files import read_regular
 from sonarpost.keys import SHORE
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.database import DATABASE_NAME, ROLES, Database
 from sonarpost.services.console.store.users import FILE_NAME, LINK_S, Users, login_link
+from sonarpost.sonar.image_files import read_image
 from sonarpost.stop_signals import stop_on_signals
 
 if TYPE_CHECKING:
@@ -126,7 +130,6 @@ def _list(_parsed: argparse.Namespace, users: Users, _config: ConsoleConfig) -> 
 
 
 def _run_view(parsed: argparse.Namespace) -> int:
-    from sonarpost.services.console.service import stored_records  # noqa: PLC0415
     from sonarpost.services.console.state import ConsoleState  # noqa: PLC0415
 
     place = place_of(parsed.view, "console --view")
@@ -146,6 +149,24 @@ def _run_view(parsed: argparse.Namespace) -> int:
         # An observer: a comment could not be sent.
         serve_page(parsed, state, folder, (("watch", "observer"),), SHORE, note)
     return 0
+
+
+def stored_records(place: ArchivePlace) -> Iterator[ReconstructedImage | Decision]:
+    """Yield the images and decisions in the archive of c2, images first. Invalid files are printed.
+
+    Raises:
+        StoredFileError: There is no archive of this version.
+    """
+    with as_folder(place, (".json", ".tiff")) as folder:
+        stored = read_stored_records(folder)
+        problems: list[Exception] = [*stored.problems]
+        for _, path in stored.images:
+            try:
+                yield stored_image(read_regular(path, MAX_FILE_BYTES), read_image(path.with_suffix(".tiff")), str(path))
+            except (BadInputError, OSError) as error:
+                problems.append(error)
+        yield from stored.decisions
+    print_rejected(problems)
 
 
 def serve_page(

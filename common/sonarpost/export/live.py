@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Final
 
@@ -48,17 +47,6 @@ class LiveContacts:
         if isinstance(record, Decision):
             return self._add_decision(record)
         return self._add_image(ImageSideCar.model_validate(side_car(record)))
-
-    def restore(self, contacts: Iterable[ExportContact]) -> list[ExportContact]:
-        """Add stored contacts; return those that were new or have changed, with their `image_path`."""
-        changed: list[ExportContact] = []
-        for contact in contacts:
-            added = [self._add_image(contact.image), *map(self._add_decision, contact.decisions)]
-            latest = next((each for each in reversed(added) if each is not None), None)
-            if latest is not None:
-                is_stored = latest.image.version == contact.image.version
-                changed.append(replace(latest, image_path=contact.image_path) if is_stored else latest)
-        return changed
 
     def located(self, limit: int) -> list[ExportContact]:
         """Return the most recently changed contacts with a position, at most `limit`, the latest last."""

@@ -16,14 +16,14 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 
 import pytest
 from builders.common import WAIT_S, eventually, free_port
-from builders.exports import Clock, contact_of, decision, image, store
+from builders.exports import Clock, contact_of, decision, image
+from builders.shore import Site
 from builders.unreached_router import check_unreached_router
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from sonarpost.cli.main import main
 from sonarpost.errors import DeliveryError, PortError
-from sonarpost.export.contacts import load_contacts
 from sonarpost.export.live import LiveContacts
 from sonarpost.extensions.alerts import command
 from sonarpost.extensions.alerts.command import AlertService, SentAlerts
@@ -274,17 +274,17 @@ def test_webhook_verifies_the_certificate(hook, tmp_path):
     assert len(hook.received) == 1
 
 
-def test_alert_command_reads_the_folder_and_the_key(hook, router, tmp_path):
-    folder = store(tmp_path / "out", image("0001"), image("0002", {"atd_confidence": 0.1}))
+def test_alert_command_reads_the_stored_contacts_and_the_key(hook, router, client, tmp_path):
+    Site(client, image("0001"), image("0002", {"atd_confidence": 0.1}))
     secret = tmp_path / "secret"
     secret.write_bytes(SECRET + b"\n")
     arguments = ["alert", "--webhook", f"http://127.0.0.1:{hook.server_port}", "--state", str(tmp_path / "state.db")]
-    arguments += ["--secret-file", str(secret), "--router", router, "--archive", str(folder)]
+    arguments += ["--secret-file", str(secret), "--router", router, "--stored"]
     hook.statuses.append(503)
     process = subprocess.Popen([sys.executable, "-m", "sonarpost.cli.main", "c2", *arguments], env=dict(os.environ))
     try:
         eventually(lambda: len(hook.received) == 2)
-        uid = load_contacts(folder).contacts[0].uid
+        uid = contact_of("0001").uid
         assert {json.loads(body)["id"] for _, _, body in hook.received} == {uid}
         process.send_signal(signal.SIGINT)
         assert process.wait() == 0

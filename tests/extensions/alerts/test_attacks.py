@@ -9,10 +9,9 @@ from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
-from builders.common import eventually, publish_once
+from builders.common import eventually
 from builders.exports import image
-
-from sonarpost import keys, wire
+from builders.shore import Site
 
 VESSEL, HOSTILE = "vessel-1", "vessel-2"
 
@@ -54,16 +53,14 @@ def receiver():
 @pytest.mark.system
 def test_refused_alerts_delay_no_other_vessel(router, client, receiver, tmp_path):
     arguments = ["c2", "alert", "--webhook", f"http://127.0.0.1:{receiver.server_address[1]}/"]
-    arguments += ["--state", str(tmp_path / "alerts.db"), "--router", router]
+    arguments += ["--state", str(tmp_path / "alerts.db"), "--router", router, "--stored"]
+    site = Site(client, *(image(f"{number:04d}", vessel_id=HOSTILE) for number in range(100)))
     process = subprocess.Popen([sys.executable, "-m", "sonarpost.cli.main", *arguments])
     try:
-        publish_once(client, keys.shore_image(HOSTILE), wire.encode(image("0000", vessel_id=HOSTILE)))
-        for number in range(1, 200):
-            client.put(keys.shore_image(HOSTILE), wire.encode(image(f"{number:04d}", vessel_id=HOSTILE)))
         eventually(lambda: receiver.replies > 1, what="an alert after the reply without an end")
         names = {f"{number:04d}" for number in range(3)}
-        for name in names:
-            client.put(keys.shore_image(VESSEL), wire.encode(image(name, vessel_id=VESSEL)))
+        site.accept(*(image(f"{number:04d}", vessel_id=HOSTILE) for number in range(100, 200)))
+        site.accept(*(image(name, vessel_id=VESSEL) for name in names))
         eventually(lambda: receiver.accepted == names, what="alerts of the other vessel")
         process.send_signal(signal.SIGINT)
         assert process.wait() == 0

@@ -148,7 +148,7 @@ def test_live_service_counts_what_the_server_has_received(authority, tmp_path):
     server.close()
 
 
-def test_command_publishes_that_nothing_is_delivered(router, client, authority, archive, tmp_path):
+def test_command_publishes_that_nothing_is_delivered(router, client, authority, tmp_path):
     records = []
 
     def receive(sample):
@@ -158,7 +158,7 @@ def test_command_publishes_that_nothing_is_delivered(router, client, authority, 
     client.declare_subscriber(keys.health("shore", "cot"), receive)
     server = TakServer(authority.server_context())
     files = TlsFiles(authority.issue("client").ca)
-    arguments = ["c2", "cot", f"tls://127.0.0.1:{server.port}", "--router", router, "--archive", archive]
+    arguments = ["c2", "cot", f"tls://127.0.0.1:{server.port}", "--router", router]
     process = subprocess.Popen([sys.executable, "-m", "sonarpost.cli.main", *arguments, *options_of(files)])
     try:
         eventually(lambda: bool(records))

@@ -13,11 +13,11 @@ from xml.etree import ElementTree as ET
 
 import pytest
 import xmlschema
-from builders.common import WAIT_S, free_port, publish_once
-from builders.exports import Clock, contact_of, image, store
+from builders.common import WAIT_S, free_port
+from builders.exports import Clock, contact_of, image
+from builders.shore import Site
 from builders.unreached_router import check_unreached_router
 
-from sonarpost import keys, wire
 from sonarpost.cli.c2.live import ContactChange
 from sonarpost.cli.main import main
 from sonarpost.errors import PortError
@@ -172,13 +172,13 @@ def test_contact_that_fails_ends_no_batch(monkeypatch):
 
 
 @pytest.mark.system
-def test_cot_command_sends_events_across_a_restart_of_the_server(router, client, tmp_path):
+def test_cot_command_sends_events_across_a_restart_of_the_server(router, client):
     """pytak reads the events; the schema of the base event accepts them."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it can use aiohttp for enrolment, which this test does not need
         import pytak
 
-    folder = store(tmp_path / "out", image("0001"))
+    site = Site(client, image("0001"))
     port = free_port()
     received = []
 
@@ -202,11 +202,11 @@ def test_cot_command_sends_events_across_a_restart_of_the_server(router, client,
         async with await asyncio.start_server(accept, "127.0.0.1", port):
             await asyncio.wait_for(done.wait(), WAIT_S)
 
-    arguments = ["c2", "cot", f"tcp://127.0.0.1:{port}", "--router", router, "--archive", str(folder)]
+    arguments = ["c2", "cot", f"tcp://127.0.0.1:{port}", "--router", router, "--stored"]
     process = subprocess.Popen([sys.executable, "-m", "sonarpost.cli.main", *arguments], env=dict(os.environ))
     try:
         asyncio.run(read("0001"))
-        publish_once(client, keys.shore_image("vessel-1"), wire.encode(image("0002")))
+        site.accept(image("0002"))
         asyncio.run(read("0002"))
         process.send_signal(signal.SIGINT)
         assert process.wait() == 0

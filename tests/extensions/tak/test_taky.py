@@ -19,7 +19,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 from builders.common import eventually
-from builders.exports import image, store
+from builders.exports import image
+from builders.shore import Site
 
 TAKY = shutil.which("taky", path=os.environ.get("SONARPOST_TAKY"))
 COT_PORT, FILES_PORT = 8089, 8443
@@ -106,12 +107,12 @@ def download(url, certificates):
         return reply.read()
 
 
-def test_clients_of_a_tak_server_receive_contacts_and_images(router, tmp_path, certificates):
-    folder = store(tmp_path / "out", image("0001"), image("0002"))
+def test_clients_of_a_tak_server_receive_contacts_and_images(router, client, certificates):
+    Site(client, image("0001"), image("0002"))
     watcher = TakClient(context_of(certificates))
     authority, certificate, key = map(str, certificates)
     server = [f"tls://localhost:{COT_PORT}", "--cot-ca", authority, "--cot-certificate", certificate, "--cot-key", key]
-    files = ["--tak-api", f"https://localhost:{FILES_PORT}", "--archive", str(folder)]
+    files = ["--tak-api", f"https://localhost:{FILES_PORT}", "--stored"]
     command = [sys.executable, "-m", "sonarpost.cli.main", "c2", "cot", *server, *files, "--router", router]
     process = subprocess.Popen(command)
     try:

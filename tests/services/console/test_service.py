@@ -7,6 +7,7 @@ import time
 from types import SimpleNamespace
 
 import httpx2
+import msgpack
 import pytest
 import zenoh
 from builders.common import eventually, free_port, publish_once
@@ -25,9 +26,9 @@ from builders.console import (
 )
 from builders.record_samples import SAMPLES
 from builders.records import decision_record
+from builders.shore import Site, relayed
 
 from sonarpost import keys, wire
-from sonarpost.archive.image_files import write_image
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import (
@@ -35,11 +36,14 @@ from sonarpost.messages import (
     Comment,
     Decision,
     LinkQuality,
+    Pixels,
     ReceivedStatus,
     Relayed,
     TaskingState,
 )
 from sonarpost.runtime.process import main
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
 from sonarpost.services.relay.config import RelayConfig
@@ -167,7 +171,8 @@ def test_a_record_that_fails_ends_no_batch(start, monkeypatch):
 
     monkeypatch.setattr(console.state, "store_images", fail)
     records = [image_record(f"{number:04}") for number in range(7)]
-    assert console._store_batch(records) == 6
+    console._store_batch(records)
+    assert console.health().counters["images_taken"] == 6
     assert console.state.counts().total == 6
 
 
@@ -261,8 +266,8 @@ def test_image_of_another_vessel_is_refused(start, client, refused):
 
 def test_shore_console_shows_images_of_c2_and_sends_comments_to_it(runner, start, client, log_in):
     c2 = runner.peer("shore-1", "c2", {keys.tasking_comment_all(): Comment, keys.tasking_command_all(): Command})
+    site = Site(client, image())
     console = start(role="shore")
-    put(client, keys.shore_image(VESSEL), image())
     eva = log_in(console, "eva", "expert")
     eventually(lambda: eva.get("/api/contacts").json()["total"] == 1, what="image")
     body = {"version": 1, "verdict": "unsure", "remark": "shadow too long"}
@@ -274,19 +279,63 @@ def test_shore_console_shows_images_of_c2_and_sends_comments_to_it(runner, start
     )
     put(client, keys.tasking_state(VESSEL), state)
     eventually(lambda: eva.contact(ID)["comments"][0]["delivery"]["state"] == "delivered", what="state")
-    put(client, keys.shore_decision(VESSEL), decision_record(image_id="00A7"))
+    site.accept(decision_record(image_id="00A7"))
     eventually(lambda: eva.contact(ID)["contact"]["review"] == "mine_like", what="decision")
     assert eva.contact(ID)["decisions"][0]["delivery"]["shore"] == "delivered"
 
 
-def test_shore_console_reads_missed_records_from_the_folder_of_c2(start, tmp_path):
-    write_image(tmp_path / "out" / VESSEL, image(2, complete=False))
-    (tmp_path / "out" / VESSEL / "broken.json").write_text("{")
-    console = start(role="shore", out_dir=tmp_path / "out")
-    eventually(lambda: console.state.counts().total == 1, what="stored image")
-    stored = console.state.image(ID, 2)
-    assert (stored.missing() == image(2, complete=False).missing()).all()
-    assert stored.pixels == image(2, complete=False).pixels
+def stored(console):
+    """Return what the database has of the images and decisions."""
+    with console.state.database.read() as db:
+        images = [tuple(row) for row in db.execute("SELECT contact_id, version, payload FROM version ORDER BY 1, 2")]
+        rows = db.execute("SELECT id, image, review, decided_by FROM contact ORDER BY id")
+        return images, [tuple(row) for row in rows]
+
+
+def test_missed_records_give_the_same_state_as_live_ones(runner, start, platform, tmp_path):
+    c2 = runner.start(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out")))
+    relay = runner.peer(VESSEL, "relay")
+    partial = image(1, complete=False)
+    pixels = partial.pixels.to_array()
+    pixels[0, 0] = pixels[35, 5] = 0  # black: received, and in a row with missing pixels
+    packed = Pixels.from_array(pixels)
+    partial = partial.model_copy(update={"pixels": packed, "pixels_sha256": packed.sha256})
+    records = [image_record("00A8"), partial, image(2), image_record("00A9", missing_rows=3)]
+    records.append(decision_record(image_id="00A7", vessel_id=VESSEL))
+
+    def send(some):
+        for record in some:
+            relay.send(keys.shore_inbox(VESSEL), "c2", relayed(record))
+
+    def is_stored(console, count):
+        images, contacts = stored(console)
+        return len(images) == count and (count < 4 or any(row[2] == "mine_like" for row in contacts))
+
+    live = runner.start(ConsoleService(platform("shore-2"), ConsoleConfig(port=0, role="shore")))
+    console = start(role="shore")
+    send(records[:1])
+    eventually(lambda: is_stored(console, 1), what="first image")
+    runner.stop(console)
+    send(records[1:])
+    eventually(lambda: is_stored(live, 4), what="live records")
+    runner.stop(c2)  # it makes its records from the files again
+    for path in (tmp_path / "out").glob("journal.db*"):
+        path.unlink()
+    runner.start(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out")))
+    console = start(role="shore")
+    eventually(lambda: is_stored(console, 4), what="missed records")
+    assert stored(console) == stored(live)
+    assert (console.state.image(ID, 1).missing() == partial.missing()).all()
+
+
+def test_record_of_another_vessel_than_its_key_is_ignored(start, client):
+    site = Site(client)
+    console = start(role="shore")
+    payload = msgpack.packb({**wire.map_of(image()), "accepted": {"archive": "0000000a", "seq": 1, "utc_s": 1.0}})
+    publish_once(client, keys.shore_image("vessel-2"), payload)
+    eventually(lambda: console.health().counters.get("records_ignored") == 1, what="ignored record")
+    site.accept(decision_record(image_id="00A7"), image_record("00A7"))
+    eventually(lambda: console.state.counts().total == 1, what="image")
 
 
 def test_decision_is_sent_after_a_restart(start_with_image, runner, start, log_in):

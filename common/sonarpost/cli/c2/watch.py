@@ -7,13 +7,12 @@ import json
 import sys
 import threading
 import time
-from collections import defaultdict, deque
 from contextlib import suppress
-from typing import Final
 
 import zenoh
 
 from sonarpost import keys, wire
+from sonarpost.bus.catch_up import AcceptedRecord, CatchUpSubscriber
 from sonarpost.bus.session import lost_reason, open_with_retry
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.shared import (
@@ -26,13 +25,9 @@ from sonarpost.cli.shared import (
     time_text,
 )
 from sonarpost.errors import PayloadError
-from sonarpost.limits import Turns, limit
 from sonarpost.messages import Decision, ReconstructedImage, Record, TaskingState
 
 POLL_S = 0.2
-MAX_WAITING: Final = limit(
-    512, "records", "shares", "live records of c2", "vessel", "records waiting", "others come from the archive"
-)
 DISCONNECTED_AFTER_S = 1.0
 
 
@@ -69,10 +64,7 @@ def run(parsed: argparse.Namespace) -> int:
 
 
 class RecordSubscription:
-    """Subscription to the records that a site publishes. Zenoh reconnects; this class logs it.
-
-    Attributes:
-        gaps: Number of interruptions and drops, after each of which records can be missing.
+    """Records that a site accepts from now on. Zenoh reconnects; this class logs it.
 
     Args:
         session: Session at the router of the site.
@@ -83,47 +75,29 @@ class RecordSubscription:
     def __init__(self, session: zenoh.Session, site: str, vessel: str | None) -> None:
         self._session = session
         self._vessel = vessel
-        self.gaps = 0
-        self._waiting: defaultdict[str, deque[tuple[str, bytes]]] = defaultdict(deque)  # by vessel
-        self._turns = Turns()
-        self._changed = threading.Condition()
-        for key in (keys.shore_contact_all(site), keys.tasking_state_all(site)):
-            session.declare_subscriber(key, self._on_sample)
+        self._turns = [
+            CatchUpSubscriber(session, key, only_new=True)
+            for key in (keys.shore_contact_all(site), keys.tasking_state_all(site))
+        ]
         self._disconnected_since_s: float | None = None
         self._disconnect_logged = False
-
-    def _on_sample(self, sample: zenoh.Sample) -> None:
-        if sample.kind != zenoh.SampleKind.PUT:
-            return
-        key = str(sample.key_expr)
-        with self._changed:
-            waiting = self._waiting[key.split("/")[-2]]
-            if len(waiting) >= MAX_WAITING:
-                self.gaps += 1
-            else:
-                waiting.append((key, sample.payload.to_bytes()))
-                self._changed.notify()
 
     def poll(self) -> ReconstructedImage | Decision | TaskingState | None:
         """Return the next record; None if there is none for 0.2 s, or if it is invalid or of another vessel."""
         self._check_connection()
-        with self._changed:
-            self._changed.wait_for(lambda: any(self._waiting.values()), POLL_S)
-            picked = self._turns.pick(self._waiting, 1)
-            if not picked:
-                return None
-            [(key, payload)] = picked
-            self._waiting[key.split("/")[-2]].popleft()
-        record = _decode(key, payload)
-        return record if record is not None and self._vessel in (None, record.vessel_id) else None
+        for timeout_s in (0.0, POLL_S / 2):
+            for _ in self._turns:
+                self._turns.reverse()
+                found = self._turns[0].poll(timeout_s)
+                if found is not None:
+                    return decoded(found, self._vessel)
+        return None
 
     def _check_connection(self) -> None:
         """Log when the connection to the router is lost and when it is restored."""
         if self._session.info.routers_zid():
-            if self._disconnected_since_s is not None:
-                self.gaps += 1
             if self._disconnect_logged:
-                _log("router reconnected; `sonarpost c2 ls` lists the records accepted in between")
+                _log("router reconnected")
             self._disconnected_since_s, self._disconnect_logged = None, False
             return
         now_s = time.monotonic()
@@ -134,20 +108,22 @@ class RecordSubscription:
             _log(f"router not reached, trying again ({lost_reason(self._session)})")
 
 
-def _decode(key: str, payload: bytes) -> ReconstructedImage | Decision | TaskingState | None:
+def decoded(found: AcceptedRecord, vessel: str | None) -> ReconstructedImage | Decision | TaskingState | None:
+    """Decode a record; None if it is invalid, which is printed, in coded form, or of another vessel than `vessel`."""
     types: dict[str, type[ReconstructedImage] | type[Decision] | type[TaskingState]] = {
         "image": ReconstructedImage,
         "decision": Decision,
         "state": TaskingState,
     }
-    record_type = types.get(key.rpartition("/")[2])
+    record_type = types.get(found.key.rpartition("/")[2])
     if record_type is None:
         return None
     try:
-        return wire.decode(record_type, payload, key)
+        record = wire.decode(record_type, found.payload, found.key)
     except PayloadError as error:
         _log(str(error))
         return None
+    return record if vessel in (None, record.vessel_id) else None
 
 
 def _fields(record: Record) -> dict[str, object]:

@@ -87,7 +87,7 @@ def run(parsed: argparse.Namespace) -> int:
         if session is None:
             return 0
         with session:
-            stream = ContactStream(session, parsed.site, parsed.vessel, parsed.archive)
+            stream = ContactStream(session, parsed.site, parsed.vessel, stored=parsed.stored)
             service = AlertService(sender, sent, parsed.threshold)
             log.info("Sending alerts", extra=kv(site=parsed.site, threshold=parsed.threshold))
             while not stop.is_set():

@@ -91,6 +91,7 @@ def add_options(parser: CommandParser) -> None:
         "HTTP interface of the TAK server, for example https://host:8443, for the images of contacts",
     )
     flag(parser, "--once", "send the contacts of --archive, without images, and end")
+    option(parser, "--archive DIR", "folder of c2, for --once", Path)
     add_live_options(parser)
     parser.set_defaults(run=run)
 
@@ -114,7 +115,7 @@ def run(parsed: argparse.Namespace) -> int:
         if session is None:
             return 0
         with session:
-            stream = ContactStream(session, parsed.site, parsed.vessel, parsed.archive)
+            stream = ContactStream(session, parsed.site, parsed.vessel, stored=parsed.stored)
             service = CotService(sender, files)
             token = session.liveliness().declare_token(keys.alive(platform, NAME))
             log.info("Sending contacts", extra=kv(endpoint=sender.endpoint, site=parsed.site))
