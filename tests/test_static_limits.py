@@ -105,8 +105,6 @@ ALLOCATIONS = {
     "common/sonarpost/link/frames/paper/receiver.py: PendingImage.add_half": "16 bits, MAX_CANDIDATES times",
     "common/sonarpost/messages/image.py: ReconstructedImage.missing": "pixels of the record",
     "common/sonarpost/sonar/geometry.py: _moving_average": "at most half the fixes",
-    "common/sonarpost/extensions/maps/geotiff.py: _pack": SENT,
-    "common/sonarpost/extensions/maps/track.py: track_of": "pings of a strip",
     "common/sonarpost/sonar/readers/jsf.py: JsfSource._channel": "_MAX_LEAD times the samples of the ping",
     "common/sonarpost/sonar/readers/svlog.py: SvlogSource._channel": "_MAX_LEAD times the samples of the ping",
     "common/sonarpost/sonar/readers/xtf_packets.py: _with_delay": "four times the samples of the ping",
