@@ -85,7 +85,6 @@ QUEUES = {
     "services/op_modem/reception.py": "MAX_UNSAVED; the source with the most loses its oldest",
     "services/uuv_modem/service.py": "MAX_EVENTS",
 }
-SENT = "the sender's own data"
 ALLOCATIONS = {
     "common/sonarpost/archive/decoder.py: Decoder.decode": "MAX_SIDE_PX of a record",
     "common/sonarpost/archive/image_parts.py": "MAX_STREAM_BYTES: `z` and the ends of the pieces are checked",
