@@ -34,7 +34,6 @@ from sonarpost.codec.registry import default_registry
 from sonarpost.delivery.outbox import Outbox
 from sonarpost.delivery.queue_sender import QueuePolicy
 from sonarpost.delivery.store import Store
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact, Health, ImagePart, Pixels, Snippet
 from sonarpost.services.console.store.users import Users
 from sonarpost.stop_signals import EXIT_WITH_PARENT
@@ -321,6 +320,7 @@ class Site:
         [number] = self.numbers(1)
         path = self.folder / f"good-{number}.xtf"
         simulator = import_module("sonarpost.extensions.simulation.seabed.survey")
+        write_xtf = import_module("sonarpost.extensions.simulation.seabed.xtf_writer").write_xtf
         write_xtf(simulator.simulate_survey(simulator.SurveySpec(seed=number + 1, pings=200, samples=512)).survey, path)
         begin_s = time.monotonic()
         path.rename(self.incoming / path.name)

@@ -19,7 +19,6 @@ import zenoh
 from builders.common import eventually, publish_once
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig, ServiceConfig
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact, Health, Pixels, Snippet
 from sonarpost.runtime.service import Service, UnitOfWork
 
@@ -190,7 +189,7 @@ def survey_bytes(tmp_path_factory):
             path = folder / f"{seed}.xtf"
             simulator = pytest.importorskip(f"{SIMULATION}.seabed.survey")
             spec = simulator.SurveySpec(seed=seed, pings=200, samples=512)
-            write_xtf(simulator.simulate_survey(spec).survey, path)
+            import_module(f"{SIMULATION}.seabed.xtf_writer").write_xtf(simulator.simulate_survey(spec).survey, path)
             made[seed] = path.read_bytes()
         return made[seed]
 
