@@ -10,13 +10,13 @@ from sonarpost.archive.journal import Criteria, Journal
 from sonarpost.archive.shore_database import ShoreDatabase
 from sonarpost.archive.shore_files import image_paths
 from sonarpost.archive.shore_index import TaskingRow
+from sonarpost.cli.console import stored_records
 from sonarpost.cli.main import main
 from sonarpost.errors import DatabaseUnavailableError
 from sonarpost.messages import Contact, Pixels
 from sonarpost.services.c2.accepted import AcceptedRecords
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
-from sonarpost.services.console.service import stored_records
 
 COUNT = 40
 
