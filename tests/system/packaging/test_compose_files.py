@@ -125,7 +125,7 @@ def test_only_keys_of_the_containers_networks_are_always_set():
     always = {f"{table}.{key}" for _, table, key, value in settings() if not re.fullmatch(r"\$\{\w+:-\}", value)}
     # A key of this list is not taken from config/*.toml.
     own = "platform.router platform.id uuv_modem.port op_modem.port c2.database"
-    assert always == {*own.split(), "console.host", "console.insecure", "console.database"}
+    assert always == {*own.split(), "console.host", "console.insecure"}
 
 
 EDITED = """
