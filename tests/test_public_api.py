@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.xtf import write_xtf
 
 import sonarpost
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.readers import read_survey
 
 HEAVY = ("numba", "numpy", "scipy", "pydantic", "zenoh", "serial", "PIL")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from builders.xtf import write_xtf
 from sonarpost.detection.settings import DetectorTuning
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey, snippets_of

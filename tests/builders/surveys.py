@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
+from builders.xtf import write_xtf
 from sonarpost.sonar.image_files import write_png, write_tiff
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
+from builders.xtf import write_xtf
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 

@@ -6,13 +6,13 @@ import threading
 
 import pytest
 from builders.common import eventually
+from builders.surveys import small_survey
+from builders.xtf import write_xtf
 from rich.console import Console
 
 from sonarpost.cli import progress as module
 from sonarpost.cli.main import LOG_LEVEL_VARIABLE, main
 from sonarpost.cli.progress import ProgressDisplay, progress_console
-from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 
 
 def test_state_has_step_amount_and_time():
@@ -71,7 +71,7 @@ def test_terminal_gets_a_bar_and_lines():
 @pytest.fixture(scope="module")
 def line(tmp_path_factory):
     path = tmp_path_factory.mktemp("survey") / "line.xtf"
-    write_xtf(simulate_survey(SurveySpec(pings=60, samples=256, targets=0, clutter=0)).survey, path)
+    write_xtf(small_survey(pings=60, samples=256), path)
     return path
 
 

@@ -5,14 +5,14 @@ import os
 import runpy
 
 import pytest
+from builders.surveys import small_survey
+from builders.xtf import write_xtf
 from pyproj import Transformer
 
 from sonarpost.cli.main import main, parser
 from sonarpost.cli.shared import survey_options_of
 from sonarpost.config import load
 from sonarpost.errors import ConfigError
-from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.sonar.options import SurveyOptions, load_options
 from sonarpost.sonar.readers import read_survey
@@ -125,7 +125,7 @@ def test_other_services_take_no_survey_options(tmp_path, config, capsys):
 
 
 def test_positions_in_metres_are_those_of_pyproj(tmp_path):
-    survey = simulate_survey(SurveySpec(seed=2, pings=60, samples=64, targets=0, clutter=0)).survey
+    survey = small_survey(pings=60, samples=64)
     write_xtf(survey, tmp_path / "metres.xtf", projected_crs="EPSG:32616")
     stored = read_survey(tmp_path / "metres.xtf", SurveyOptions(projected_crs="EPSG:32616"))
     to_utm = Transformer.from_crs("EPSG:4326", "EPSG:32616", always_xy=True)

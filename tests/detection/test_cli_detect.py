@@ -7,6 +7,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from builders.xtf import write_xtf
 from PIL import Image
 
 from sonarpost.cli.detection import command
@@ -16,7 +17,6 @@ from sonarpost.detection.detector import CLUTTER, MINE_LIKE, STRUCTURE
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import AtdClass, Contact
 from sonarpost.sonar.side_car import read_side_car
 from sonarpost.sonar.survey import Side

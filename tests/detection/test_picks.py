@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
+from builders.xtf import write_xtf
 
 from sonarpost.cli.main import main
 from sonarpost.detection import picks as picks_module
@@ -23,7 +24,6 @@ from sonarpost.detection.picks import (
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.stream import FileOrigin
 from sonarpost.errors import ConfigError
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact
 from sonarpost.services.atd_stub.snippet_files import read_snippet
 from sonarpost.sonar.image_files import read_image

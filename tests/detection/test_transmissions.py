@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.xtf import write_xtf
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,7 +18,6 @@ from sonarpost.detection.detector import detect
 from sonarpost.detection.stream import FileOrigin, StreamDetector
 from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals, masked_pings
 from sonarpost.errors import ConfigError
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import ChannelPing, Ping, Side

@@ -3,12 +3,12 @@
 from dataclasses import replace
 
 import pytest
+from builders.xtf import write_xtf
 
 from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.geometry import along_track_m, ping_spacing_m
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import read_survey

@@ -6,13 +6,13 @@ import json
 import numpy as np
 import pytest
 from builders.surveys import make_xtf
+from builders.xtf import write_xtf
 from PIL import Image
 from pyproj import Transformer
 
 from sonarpost.cli.main import main
 from sonarpost.cli.survey.plot import SIDE_PX, angle_normalised, reduce_survey, thinned_track
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 from builders import surveys
+from builders.xtf import write_xtf
 from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Transformer
 
 from sonarpost.cli.main import main
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.geometry import Position, along_track_m, offset_position
 from sonarpost.sonar.navigation import position_in_degrees
 from sonarpost.sonar.options import SurveyOptions

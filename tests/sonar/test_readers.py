@@ -6,10 +6,10 @@ import types
 
 import pytest
 from builders.surveys import make_xtf
+from builders.xtf import write_xtf
 
 from sonarpost import registry
 from sonarpost.errors import ConfigError, SurveyFileError
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar import readers
 from sonarpost.sonar.options import load_options
 from sonarpost.sonar.readers import open_survey, read_survey, recording_parts, supported_suffixes

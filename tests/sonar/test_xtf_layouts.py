@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from builders.surveys import small_survey
 from builders.two_frequencies import FIRST_HZ, SECOND_HZ, with_second_frequency
+from builders.xtf import write_xtf
 from builders.xtf_layouts import (
     FILE_HEADER,
     ONE_FREQUENCY,
@@ -21,7 +22,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import open_survey, read_survey
 from sonarpost.sonar.survey import Side

@@ -5,9 +5,9 @@ import struct
 from dataclasses import replace
 
 import pytest
+from builders.xtf import write_xtf
 from pyxtf import XTFPingHeader
 
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
 from sonarpost.sonar.options import Mounting, SurveyOptions
 from sonarpost.sonar.readers import open_survey, read_survey

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+from builders.xtf import write_xtf
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -15,7 +16,6 @@ from pyproj import Transformer
 from pyxtf import XTFPingHeader
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.geometry import Position, offset_between_m, slant_to_ground_range_m
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import read_survey

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 import pyxtf
+from builders.xtf import write_xtf
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import read_survey
 from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey

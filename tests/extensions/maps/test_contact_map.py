@@ -6,13 +6,13 @@ from dataclasses import replace
 import pytest
 import tifffile
 from builders.survey_lines import brightest_px, pixel
+from builders.xtf import write_xtf
 
 from sonarpost.cli.main import main
 from sonarpost.detection import candidates
 from sonarpost.detection.detector import detect
 from sonarpost.extensions.maps.contact_map import contact_map
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 
 
 @pytest.fixture(scope="module", autouse=True)

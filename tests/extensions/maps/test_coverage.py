@@ -14,13 +14,13 @@ import pytest
 from builders import gdal
 from builders.survey_lines import ALTITUDE_M, RANGE_M, course, line, with_turn
 from builders.surveys import make_xtf
+from builders.xtf import write_xtf
 from pyproj import Geod
 
 from sonarpost.cli.main import main
 from sonarpost.errors import SurveyFileError
 from sonarpost.extensions.maps import track
 from sonarpost.extensions.maps.coverage import survey_coverage, write_coverage_geojson, write_coverage_geopackage
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.sonar.geometry import Position, offset_position
 
 REACH_M = math.sqrt(RANGE_M**2 - ALTITUDE_M**2)

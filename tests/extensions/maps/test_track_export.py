@@ -7,9 +7,9 @@ import json
 
 import pytest
 from builders.surveys import make_xtf, small_survey
+from builders.xtf import write_xtf
 
 from sonarpost.cli.main import main
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 
 
 def test_export_csv(tmp_path, capsys):

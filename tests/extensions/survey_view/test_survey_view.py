@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders.speckle_survey import make_survey
+from builders.xtf import write_xtf
 from PIL import Image
 from starlette.testclient import TestClient
 
@@ -16,7 +17,6 @@ from sonarpost.cli.main import main
 from sonarpost.detection.picks import Pick, parse_picks
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.errors import ConfigError
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.extensions.survey_view import waterfall as waterfall_module
 from sonarpost.extensions.survey_view.command import detected, stored_picks
 from sonarpost.extensions.survey_view.waterfall import Waterfall

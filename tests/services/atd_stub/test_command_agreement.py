@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 from builders.joined_surveys import FEW_CANDIDATES, Box, near, split, survey_of
+from builders.xtf import write_xtf
 
 from sonarpost.cli.main import main
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import StoredEnd, pack, unpack

@@ -16,6 +16,7 @@ from builders.joined_surveys import (
     split,
     survey_of,
 )
+from builders.xtf import write_xtf
 
 from sonarpost import wire
 from sonarpost.detection.association import DetectionPlace
@@ -23,7 +24,6 @@ from sonarpost.detection.settings import DetectorTuning
 from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamEnd
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.file_boundary import StoredEnd, pack, unpack

@@ -9,10 +9,10 @@ from builders.common import eventually
 from builders.joined_surveys import Box, split, survey_of
 from builders.survey_oracle import tiny_survey
 from builders.surveys import make_xtf, small_survey
+from builders.xtf import write_xtf
 
 from sonarpost.detection.stream import _FileSearch
 from sonarpost.errors import SurveyFileError
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.services.atd_stub import survey_detection
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.survey_detection import detect_in_survey

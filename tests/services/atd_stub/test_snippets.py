@@ -10,6 +10,7 @@ import pytest
 from builders.common import eventually
 from builders.joined_surveys import FEW_CANDIDATES
 from builders.record_samples import BARE_CONTACT, FULL_CONTACT
+from builders.xtf import write_xtf
 from PIL import Image
 
 from sonarpost.config import load
@@ -20,7 +21,6 @@ from sonarpost.detection.snippets import ground_projected_image
 from sonarpost.detection.stream import FileOrigin
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.input_folder import InputFile, StableFiles, list_input_files

@@ -8,12 +8,12 @@ import msgpack
 import pytest
 from builders.common import eventually
 from builders.joined_surveys import Box, near, survey_of
+from builders.xtf import write_xtf
 
 from sonarpost import keys, wire
 from sonarpost.cli.detection.options import read_transmissions
 from sonarpost.delivery.store import Store
 from sonarpost.errors import DeliveryError
-from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.messages import Transmission, Transmissions
 from sonarpost.modem.interface import TransmissionEnded, TransmissionStarted
 from sonarpost.services.atd_stub.transmissions import MAX_RETAINED, RETAINED_S, SAVE_INTERVAL_S, TransmissionLog
