@@ -70,6 +70,19 @@ def test_packets_are_published_with_consecutive_numbers(modem_pair, begin, obser
     check_monitoring(service)
 
 
+def test_a_packet_is_one_commit(begin, monkeypatch):
+    service, commits = begin(image_consumers=[]), []
+    transaction = service.store.transaction
+    monkeypatch.setattr(service.store, "transaction", lambda: commits.append(1) or transaction())
+    for number in (1, 4, 7):
+        frames = [received(preview_frame(number + n), n + 1) for n in range(3)]
+        for frame in frames:
+            service.on_modem_event(FrameDecoded(frame))
+        service.on_modem_event(packet(*frames))
+    assert service.health().gauges["images_incomplete"] == 9.0
+    assert len(commits) == 3
+
+
 def test_packet_numbers_continue_after_a_restart(begin, runner, observed):
     for number in range(1, 4):
         service = begin()
