@@ -16,9 +16,8 @@ from typing_extensions import override
 from sonarpost.codec.interface import MIN_SIDE_PX
 from sonarpost.detection.detector import Detection
 from sonarpost.detection.difficulty import Difficulty
-from sonarpost.detection.record import contact_record
 from sonarpost.detection.snippets import cut_expanded, cut_snippet, ground_projected_image
-from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector, StreamEnd
+from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector, StreamEnd, contact_record
 from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals
 from sonarpost.errors import SurveyFileError
 from sonarpost.limits import limit

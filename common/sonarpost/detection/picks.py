@@ -31,9 +31,8 @@ from sonarpost.detection.detector import (
 )
 from sonarpost.detection.matched_filter import Peak, highlight_size_cells, matched_response
 from sonarpost.detection.normalisation import LevelGrid, normalise_side
-from sonarpost.detection.record import contact_record
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.stream import STRIP_PINGS, FileOrigin, PingOrigin
+from sonarpost.detection.stream import STRIP_PINGS, FileOrigin, PingOrigin, contact_record
 from sonarpost.errors import ConfigError
 from sonarpost.messages import Contact
 from sonarpost.sonar.bottom_track import altitudes_m

@@ -26,6 +26,7 @@ from sonarpost.detection.association import DetectionPlace
 from sonarpost.detection.detector import Detection, search
 from sonarpost.detection.difficulty import Difficulty, combined
 from sonarpost.detection.settings import DetectorSettings
+from sonarpost.messages import Contact
 from sonarpost.sonar.channel_sets import is_same_frequency
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.source import Strip, SurveySource, strips
@@ -72,6 +73,47 @@ class FileOrigin:
         """Return the identifier of a contact whose centre is in this file."""
         place = f"{detection.ping_number}-{detection.side.value}-{detection.sample}"
         return f"{self.line_name[:60]}-{self.content[:8]}-{place}"
+
+
+def contact_record(detection: Detection, origin: FileOrigin, vehicle_id: str, sonar_id: str) -> Contact:
+    """Return the contact record of a detection. A height is set only if the shadow was recorded to its end.
+
+    Args:
+        detection: The detection.
+        origin: The file of its ping.
+        vehicle_id: Vehicle of the record.
+        sonar_id: Sonar, as the file names it.
+    """
+    d = detection
+    return Contact(
+        contact_id=origin.contact_id(d),
+        vehicle_id=vehicle_id,
+        sonar_id=sonar_id,
+        line_name=origin.line_name,
+        ping_number=d.ping_number,
+        channel=d.side.value,
+        time_utc_s=d.time_utc_s,
+        lat_deg=d.position.lat_deg if d.position else None,
+        lon_deg=d.position.lon_deg if d.position else None,
+        position_sigma_m=d.position_sigma_m,
+        position_note=d.position_note,
+        depth_m=d.depth_m,
+        altitude_m=d.altitude_m,
+        heading_deg=d.heading_deg,
+        speed_mps=d.speed_mps,
+        slant_range_m=d.slant_range_m,
+        ground_range_m=d.ground_range_m,
+        atd_class=d.atd_class,
+        atd_confidence=d.confidence,
+        length_m=d.length_m,
+        width_m=d.width_m,
+        shadow_m=d.shadow_m,
+        height_m=None if d.shadow_is_cut else d.height_m,
+        pixel_along_m=d.pixel_along_m,
+        pixel_across_m=d.pixel_across_m,
+        p_mine_like=d.p_mine_like,
+        p_other_object=d.p_other_object,
+    )
 
 
 class PingOrigin(NamedTuple):

@@ -43,10 +43,16 @@ from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
 from sonarpost.detection.detector import MINE_LIKE, Detection, counts_text
 from sonarpost.detection.difficulty import Difficulty, combined
 from sonarpost.detection.picks import PICKED, LocatedPick, PickedDetection
-from sonarpost.detection.record import contact_record
 from sonarpost.detection.settings import DetectorSettings, checked_settings, load_settings
 from sonarpost.detection.snippets import cut_snippet, ground_projected_image
-from sonarpost.detection.stream import FileOrigin, PingOrigin, StreamContact, StreamDetector, StripDifficulty
+from sonarpost.detection.stream import (
+    FileOrigin,
+    PingOrigin,
+    StreamContact,
+    StreamDetector,
+    StripDifficulty,
+    contact_record,
+)
 from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.files import write_atomically
