@@ -40,6 +40,8 @@ IMAGE_IDS = MAX_NUMBER
 _KINDS: Final[tuple[CommandKind, ...]] = ("refine", "resend", "expand", "original", "region")
 _CONSUMER = "uuv_modem"
 _NEXT_IMAGE = "next_image"
+QUICK_PIXELS: Final = 32_768
+"""Size of an image that is encoded while its sender waits: less than a second on a slow computer."""
 _COMMAND_PRIORITY = 3
 """Delivery priority of images that the vessel has requested."""
 
@@ -73,6 +75,11 @@ class CompressorService(Service[CompressorConfig]):
         """Return the keys of this vehicle's snippets, and of commands for its images."""
         commands = {keys.command(self.platform.id, kind): Command for kind in _KINDS}
         return {keys.contact_detected(self.platform.id): Snippet, **commands}
+
+    @override
+    def is_quick(self, record: Record) -> bool:
+        """Return whether a record is a small snippet."""
+        return isinstance(record, Snippet) and record.pixels.height_px * record.pixels.width_px <= QUICK_PIXELS
 
     @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:

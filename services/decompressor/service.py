@@ -33,6 +33,8 @@ log = logging.getLogger(__name__)
 STREAM_CONSUMER = "relay"
 """The consumer that gets the coded stream: the link to the shore site carries no pixels."""
 WATCHERS = "watchers"
+QUICK_PIXELS = 32_768
+"""Size of an image that is decoded while its sender waits: less than a second on a slow computer."""
 SUBSCRIBERS_UNKNOWN_S = 1.0
 """Time after the start in which the router may not have reported all subscribers: pixels are published."""
 
@@ -95,6 +97,12 @@ class DecompressorService(Service[DecompressorConfig]):
         assert isinstance(record, ReceivedImage)
         if record.vessel_id != self.platform.id:
             raise PayloadError(key, "vessel_id", record.vessel_id, self.platform.id)
+
+    @override
+    def is_quick(self, record: Record) -> bool:
+        """Return whether an image is small."""
+        assert isinstance(record, ReceivedImage)
+        return (record.height_px or 0) * (record.width_px or 0) <= QUICK_PIXELS
 
     @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:

@@ -480,6 +480,13 @@ def test_record_that_cannot_be_handled_when_it_is_accepted_waits_in_the_inbox(co
     assert consumer_at_once.store.inbox_depth() == 0
 
 
+def test_record_that_is_not_quick_waits_in_the_inbox_and_no_later_one_overtakes_it(consumer_at_once, ask, monkeypatch):
+    monkeypatch.setattr(consumer_at_once, "is_quick", lambda record: record.decision_id != "d2")
+    assert ask([item(n, decision(n)) for n in (1, 2, 3)]) == (AckReply("stored"),) * 3
+    eventually(lambda: consumer_at_once.got == ["d1", "d2", "d3"])
+    assert list(consumer_at_once.threads.values()) == ["inbox-consumer", "work", "work"]
+
+
 def test_record_whose_effects_cannot_be_written_is_accepted_once(consumer_at_once, ask):
     consumer_at_once.invalid_states = {"d1"}
     assert ask([item(1, decision(1))]).status == "stored"

@@ -197,7 +197,8 @@ class RecordHandler:
 
                 def handle(key: str, payload: bytes, record: Record) -> bool:
                     nonlocal limit
-                    if len(handled) >= limit:
+                    if len(handled) >= limit or not self._service.is_quick(record):
+                        limit = 0  # later records do not overtake it
                         return self.keep_decoded(key, payload, record)
                     try:
                         with log_context(payload):

@@ -51,8 +51,8 @@ class Service(ABC, Generic[C]):
         BATCH: Maximum number of records that are committed in one transaction. Above 1, a power cut can repeat the
             side effects of `handle` outside the `UnitOfWork` for a whole batch.
         MAX_AT_ONCE: Maximum number of records that are handled in the transaction that accepts them, while no earlier
-            record waits; 1 if `handle` is slow, 0 if it opens a transaction, or must not be repeated because it has
-            effects outside the `UnitOfWork`, which stay if the transaction fails.
+            record waits; 0 if `handle` opens a transaction, or must not be repeated because it has effects outside the
+            `UnitOfWork`, which stay if the transaction fails. See `is_quick`.
         BATCH_BYTES: Maximum size of the records of one batch; it bounds the write-ahead log.
         PAGE_BYTES: Page size of the store; small pages for a service whose transactions change few bytes.
     """
@@ -115,6 +115,13 @@ class Service(ABC, Generic[C]):
         Raises:
             BadInputError: The record is refused; its sender quarantines it.
         """
+
+    def is_quick(self, record: Record) -> bool:
+        """Return whether a record can be handled in the transaction that accepts it; by default every record.
+
+        Its sender, and transactions of other threads, wait until it is handled, and so does the end of the service.
+        """
+        return True
 
     def check_capacity(self, key: str) -> None:
         """Check that a record on `key` can be stored; the default checks the disk reserve.
