@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from statistics import mean
+from textwrap import wrap
 
 import grimp
 
@@ -19,6 +20,7 @@ BOX_PADDING_PX = 20
 BOX_GAP_PX = 24
 CHARACTER_PX = 8
 LANE_PX = 24
+LINE_PX = 18
 SWEEPS = 20
 # The layers from this package down are one box: every package above imports them.
 GROUND = "config"
@@ -37,12 +39,16 @@ def drawing(_: str = "") -> str:
     x_px = _positions(row_of, arrows(upper))
     drawn = [_arrow(arrow, row_of, x_px) for arrow in arrows(upper)]
     drawn += [_box(name, row, x_px[row][name], found[name]) for name, row in row_of.items()]
-    height_px = (ground + 1) * ROW_PX
-    base = ", ".join(name for names in rows[ground:] for name in names)
+    names = ", ".join(name for below in rows[ground:] for name in below)
+    lines = ["ground floor, which every package above may import:", *wrap(names, WIDTH_PX // CHARACTER_PX)]
+    top_px = _y(ground) - BOX_HEIGHT_PX / 2
+    height_px = top_px + len(lines) * LINE_PX + BOX_PADDING_PX
     drawn.append(
-        f'<rect x="1" y="{_y(ground) - BOX_HEIGHT_PX / 2}" width="{WIDTH_PX - 2}" height="44" rx="4"/>'
-        f'<text x="{WIDTH_PX / 2}" y="{_y(ground) + 3}">ground floor, which every package above may import:</text>'
-        f'<text x="{WIDTH_PX / 2}" y="{_y(ground) + 20}">{base}</text>'
+        f'<rect x="1" y="{top_px}" width="{WIDTH_PX - 2}" height="{height_px - top_px - 1}" rx="4"/>'
+        + "".join(
+            f'<text x="{WIDTH_PX / 2}" y="{top_px + (number + 1) * LINE_PX + 4}">{line}</text>'
+            for number, line in enumerate(lines)
+        )
     )
     return (
         f'<svg class="packages" viewBox="0 0 {WIDTH_PX} {height_px}" role="img" aria-label="packages and imports">'
