@@ -67,7 +67,6 @@ class ModemCapabilities:
         min_address: Least address of a modem.
         max_address: Greatest address of a modem, at most 255.
         broadcast: Destination address of all modems, None if the modem has no broadcast.
-        half_duplex: Whether the modem receives nothing while it transmits.
         acknowledgements: Whether `ack` requests acoustic acknowledgements of frames.
         ranging: Whether `ping` measures the travel time to another modem.
         polling: Whether `request_packet` polls another modem.
@@ -80,7 +79,6 @@ class ModemCapabilities:
     min_address: int = 0
     max_address: int = MAX_ADDRESS
     broadcast: int | None = None
-    half_duplex: bool = True
     acknowledgements: bool = False
     ranging: bool = False
     polling: bool = False

@@ -24,7 +24,6 @@ CAPABILITIES = ModemCapabilities(
     downlink_rate=0,
     max_address=254,
     broadcast=255,
-    half_duplex=False,
     acknowledgements=True,
 )
 """Capabilities of the driver."""
