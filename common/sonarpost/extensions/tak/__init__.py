@@ -7,5 +7,5 @@ from sonarpost.cli.parsing.commands import CommandSpec
 COT: Final = CommandSpec(
     "send the contacts of a shore site to a TAK endpoint, live, until Ctrl-C, or once",
     "sonarpost.extensions.tak.command:add_options",
-    "tls://tak.example:8089 --tak-api https://tak.example:8443 --archive out",
+    "tls://tak.example:8089 --tak-api https://tak.example:8443 --stored",
 )
