@@ -2,7 +2,7 @@
 
     python -m research.training.emb.sheets --data DIR --out docs/explanation/codecs 22 64 192
     python -m research.training.emb.sheets --data DIR --out docs/explanation/codecs \
-        --codecs emb emb:structure -- 64 128
+        --codecs emb emb:structure -- 64
 
 The images may be published: they are from the public-domain Humminbird recording (its last fifth) and the simulator.
 """
