@@ -30,7 +30,7 @@ from builders.common import REPOSITORY, WAIT_S, eventually, free_port
 from builders.fleet_certificates import World
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config
-from sonarpost.codec.registry import default_registry
+from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.delivery.outbox import Outbox
 from sonarpost.delivery.queue_sender import QueuePolicy
 from sonarpost.delivery.store import Store
@@ -49,7 +49,7 @@ MEMORY_BYTES = 512 * 1024 * 1024
 def coded_part(number: int, side_px: int = 48) -> ImagePart:
     """Return a coded image; each number gives other pixels."""
     pixels = np.random.default_rng(number).integers(0, 256, (side_px, side_px), dtype=np.uint8)
-    stream = default_registry().create("emb").encode(pixels, 200)
+    stream = default_registry().create("emb", CodecResources(strength=0.0)).encode(pixels, 200)
     return ImagePart(u="uuv-1", i=f"{number:04d}", n=1, t=1_700_000_000.0 + number, p=stream)
 
 
