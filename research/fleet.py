@@ -59,7 +59,7 @@ from typing_extensions import override
 from research.common.ports import free_ports
 from research.recording_relay import acknowledged
 from sonarpost import keys, wire
-from sonarpost.archive.shore_index import ShoreIndex
+from sonarpost.archive.reader import open_reader
 from sonarpost.bus.session import client_config
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.codec.registry import default_registry
@@ -478,11 +478,8 @@ def read_int(store: Path, sql: str) -> int:
 
 def images_at_shore(out_dir: Path) -> int:
     """Return the number of images in the index of c2."""
-    index = ShoreIndex(out_dir, writable=False)
-    try:
-        return len(index.images())
-    finally:
-        index.close()
+    with open_reader(out_dir) as archive:
+        return len(archive.images())
 
 
 def figures(

@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import Field
 from typing_extensions import override
 
-from sonarpost.archive.postgresql import DatabaseAddress
+from sonarpost.archive.address import DatabaseAddress
 from sonarpost.codec.vq.codebook import open_codebook
 from sonarpost.config import PlatformConfig, with_keys
 from sonarpost.keys import SHORE

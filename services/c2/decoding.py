@@ -11,10 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Final
 
-import msgpack
-
-from sonarpost import keys, wire
+from sonarpost import wire
 from sonarpost.archive import image_parts
+from sonarpost.archive.backlog import Backlog, BacklogRecord
 from sonarpost.archive.decode_worker import Decoded, DecodeWorker
 from sonarpost.delivery.store import Store
 from sonarpost.errors import BadInputError, DeliveryError, can_concern_record
@@ -25,8 +24,6 @@ from sonarpost.runtime.service import ServiceStoppingError
 
 log = logging.getLogger(__name__)
 
-BACKLOG: Final = "undecoded/"
-"""Prefix of the states with accepted images: `undecoded/{vessel}/{number}`, in the order of their acceptance."""
 SURFACE: Final = "decoding of images"
 BATCH_PER_WORKER: Final = limit(
     4, "images", "shares", SURFACE, "vessel", "images of a turn for each decoding process", "the next vessel follows"
@@ -51,49 +48,14 @@ MAX_MODELS: Final = limit(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class AcceptedImage:
-    """An entry of the backlog.
+def coded_image(entry: BacklogRecord) -> CodedImage:
+    """Return the coded image of an entry of the backlog.
 
-    Attributes:
-        name: Name of its state.
-        vessel_id: Vessel that sent it.
-        payload: The record `part` of the whole image.
+    Raises:
+        PayloadError: It is invalid.
     """
-
-    name: str
-    vessel_id: str
-    payload: bytes
-
-    @classmethod
-    def unpack(cls, name: str, value: bytes) -> AcceptedImage:
-        """Parse the value of a state."""
-        vessel_id, payload = msgpack.unpackb(value)
-        return cls(name, vessel_id, payload)
-
-    def pack(self) -> bytes:
-        """Return the value of its state."""
-        packed: bytes = msgpack.packb((self.vessel_id, self.payload))
-        return packed
-
-    def coded_image(self) -> CodedImage:
-        """Return the coded image."""
-        where = f"image of {self.vessel_id}"
-        return image_parts.coded_image(wire.decode(ImagePart, self.payload, where), self.vessel_id, where)
-
-
-class BacklogNames:
-    """Names of new entries of the backlog, in ascending order also after a restart with an earlier clock."""
-
-    def __init__(self, store: Store) -> None:
-        names = store.state_names(BACKLOG)
-        numbers = (name.rpartition("/")[2] for name in names)
-        self._last = max((int(number) for number in numbers if number.isdecimal()), default=0)
-
-    def next(self, vessel_id: str) -> str:
-        """Return a new name for an image of a vessel."""
-        self._last = max(self._last + 1, time.time_ns())
-        return f"{BACKLOG}{vessel_id}/{self._last:020d}"
+    where = f"image of {entry.vessel_id}"
+    return image_parts.coded_image(wire.decode(ImagePart, entry.payload, where), entry.vessel_id, where)
 
 
 @dataclass
@@ -164,32 +126,32 @@ class _Vessel:
     """Images of one vessel.
 
     Attributes:
-        after: Name of the last entry that was tried.
-        failing: Images that failed, by name; they are tried again, each alone.
+        after: Number of the last entry that was tried.
+        failing: Images that failed, by number; they are tried again, each alone.
         failures: Consecutive failures.
         retry_at_s: When its images are tried again, by the monotonic clock.
     """
 
-    after: str
-    failing: dict[str, _Failing] = field(default_factory=dict)
+    after: int = 0
+    failing: dict[int, _Failing] = field(default_factory=dict)
     failures: int = 0
     retry_at_s: float = 0.0
 
 
 class Decoding:
-    """Decodes the backlog of a store with several processes: the vessels in turn, the images of each oldest first.
+    """Decodes the backlog of c2 with several processes: the vessels in turn, the images of each oldest first.
 
     An image whose codebook is not known stays in the backlog until the codebook is there. After a failure that is not
     known to be one of the image, its vessel pauses and the image is tried again.
 
     Args:
-        store: Store of c2.
+        store: Store of c2, for the quarantine.
+        backlog: Returns the backlog.
         workers: The decoding processes.
-        keep: Called with decoded images and their entries; writes the images to the disk and publishes them. Raises
-            an exception if that is not possible now; the images are decoded again.
-        on_undecodable: Called with each image that was quarantined.
+        keep: Called with decoded images and their entries; stores the images, removes the entries from the backlog, and
+            publishes the images. Raises an exception if that is not possible now; the images are decoded again.
+        on_undecodable: Called with each image that was quarantined; removes it from the backlog.
         stopping: Set when the service stops.
-        site: Name of the site in keys.
 
     Attributes:
         fault: Why images wait; empty if they do not.
@@ -198,19 +160,19 @@ class Decoding:
     def __init__(
         self,
         store: Store,
+        backlog: Callable[[], Backlog],
         workers: Sequence[DecodeWorker],
-        keep: Callable[[Sequence[ReconstructedImage], Sequence[AcceptedImage]], None],
-        on_undecodable: Callable[[AcceptedImage, str], None],
+        keep: Callable[[Sequence[ReconstructedImage], Sequence[BacklogRecord]], None],
+        on_undecodable: Callable[[BacklogRecord, str], None],
         stopping: threading.Event,
-        site: str = keys.SHORE,
     ) -> None:
         self._store = store
+        self._backlog = backlog
         self.workers = list(workers)
         self._idle = list(workers)  # its methods are atomic
         self._keep = keep
         self._on_undecodable = on_undecodable
         self._stopping = stopping
-        self._site = site
         self._changed = threading.Event()
         self._from_start: set[str] = set()
         self._vessels: dict[str, _Vessel] = {}
@@ -268,53 +230,43 @@ class Decoding:
         self._decode(pool, again)
         return bool(next_ or again)
 
-    def _next(self) -> list[AcceptedImage]:
+    def _next(self) -> list[BacklogRecord]:
         """Return the next entries, of all vessels in turn."""
         count = BATCH_PER_WORKER * len(self.workers)
-        names = [name for name in self._names() if self._is_due(name)]
+        backlog = self._backlog()
+        names = [name for name in backlog.waiting_vessels() if self._is_due(name)]
         share = -(-count // max(1, len(names)))
-        waiting: dict[str, list[tuple[str, bytes]]] = {}
-        for name in names:
-            prefix = f"{BACKLOG}{name}/"
-            waiting[name] = self._store.states_after(prefix, self._vessel(name).after, share)
+        waiting = {name: backlog.waiting(name, self._vessel(name).after, share) for name in names}
         picked = self._turns.pick({name: entries for name, entries in waiting.items() if entries}, count)
-        for name, _ in picked:
-            self._vessel(_vessel_of(name)).after = name
-        return self._parsed(picked)
-
-    def _names(self) -> Iterator[str]:
-        """Yield the vessels with images in the backlog."""
-        after = BACKLOG
-        while found := self._store.states_after(BACKLOG, after, 1):
-            yield (name := _vessel_of(found[0][0]))
-            after = f"{BACKLOG}{name}/\U0010ffff"
+        for entry in picked:
+            self._vessel(entry.vessel_id).after = entry.id
+        return picked
 
     def _vessel(self, name: str) -> _Vessel:
-        return self._vessels.setdefault(name, _Vessel(f"{BACKLOG}{name}/"))
+        return self._vessels.setdefault(name, _Vessel())
 
     def _is_due(self, name: str) -> bool:
         return self._vessel(name).retry_at_s <= time.monotonic()
 
-    def _again(self) -> list[AcceptedImage]:
+    def _again(self) -> list[BacklogRecord]:
         """Return the failed image that has waited longest, if its vessel does not pause."""
-        due = {name: list(v.failing) for name, v in self._vessels.items() if v.failing and self._is_due(name)}
-        names = self._again_turns.pick(due, 1)
-        found = self._parsed([(name, self._store.get_state(name) or b"") for name in names])
-        if not found:
-            for name in names:
-                self._vessel(_vessel_of(name)).failing.pop(name)
+        due = {n: [(n, id_) for id_ in v.failing] for n, v in self._vessels.items() if v.failing and self._is_due(n)}
+        found: list[BacklogRecord] = []
+        for name, id_ in self._again_turns.pick(due, 1):
+            entry = self._backlog().waiting_record(id_)
+            if entry is None:
+                self._vessel(name).failing.pop(id_)
+            else:
+                found.append(entry)
         return found
 
-    def _parsed(self, entries: Sequence[tuple[str, bytes]]) -> list[AcceptedImage]:
-        return list(self._store.readable(dict(entries), AcceptedImage.unpack).values())
-
-    def _decode(self, pool: ThreadPoolExecutor, batch: Sequence[AcceptedImage]) -> None:
+    def _decode(self, pool: ThreadPoolExecutor, batch: Sequence[BacklogRecord]) -> None:
         results = list(pool.map(self._decode_one, batch))
         if self._stopping.is_set():
             return
         is_alone = len(batch) == 1
         failed: dict[str, float] = {}
-        decoded: list[tuple[AcceptedImage, ReconstructedImage]] = []
+        decoded: list[tuple[BacklogRecord, ReconstructedImage]] = []
         for entry, (result, taken_s) in zip(batch, results, strict=True):
             if result.image is not None:
                 decoded.append((entry, result.image))
@@ -324,7 +276,7 @@ class Decoding:
                 lost_s = taken_s if result.failure == "crash" else 0.0
                 failed[entry.vessel_id] = max(lost_s, failed.get(entry.vessel_id, 0.0))
             elif result.missing_model and self.missing.add(result.missing_model, entry.vessel_id):
-                self._vessel(entry.vessel_id).failing.pop(entry.name, None)
+                self._vessel(entry.vessel_id).failing.pop(entry.id, None)
             else:
                 self._quarantine(entry, result.reason)
         for group in _groups(decoded):
@@ -335,12 +287,12 @@ class Decoding:
             vessel.failures = min(vessel.failures + 1, 10)
             vessel.retry_at_s = time.monotonic() + pause_s
 
-    def _decode_one(self, entry: AcceptedImage) -> tuple[Decoded, float]:
+    def _decode_one(self, entry: BacklogRecord) -> tuple[Decoded, float]:
         """Decode an image; return the result and the duration in seconds."""
         started_s = time.monotonic()
         worker = self._idle.pop()
         try:
-            result = worker.decode(entry.coded_image())
+            result = worker.decode(coded_image(entry))
         except BadInputError as error:
             result = Decoded(reason=str(error))
         except Exception as error:
@@ -350,7 +302,7 @@ class Decoding:
             self._idle.append(worker)
         return result, time.monotonic() - started_s
 
-    def _keep_parts(self, group: Sequence[tuple[AcceptedImage, ReconstructedImage]], *, is_alone: bool) -> set[str]:
+    def _keep_parts(self, group: Sequence[tuple[BacklogRecord, ReconstructedImage]], *, is_alone: bool) -> set[str]:
         """Store images, after a failure in halves; return the vessels of those that cannot be stored."""
         entries = [entry for entry, _ in group]
         try:
@@ -367,47 +319,39 @@ class Decoding:
                 log.exception("Image not stored after an unexpected exception")
             self._failed(entries[0], str(error) or type(error).__name__, counts=is_alone and can_concern_record(error))
             return {entries[0].vessel_id}
-        with self._store.transaction() as tx:
-            for entry in entries:
-                tx.delete_state(entry.name)
         self._stored += len(entries)
         for entry in entries:
             vessel = self._vessel(entry.vessel_id)
-            vessel.failing.pop(entry.name, None)
+            vessel.failing.pop(entry.id, None)
             vessel.failures, vessel.retry_at_s = 0, 0.0
         return set()
 
-    def _failed(self, entry: AcceptedImage, reason: str, *, counts: bool) -> None:
+    def _failed(self, entry: BacklogRecord, reason: str, *, counts: bool) -> None:
         """Try an image again later; quarantine it if it alone has failed and others were stored in between."""
         self._reason = reason
         vessel = self._vessel(entry.vessel_id)
         log.error("Image not decoded and stored; it is tried again", extra=kv(vessel=entry.vessel_id, reason=reason))
-        before = vessel.failing.pop(entry.name, None)
+        before = vessel.failing.pop(entry.id, None)
         alone = before.alone if before else 0
         if before is not None and counts and before.stored != self._stored:
             alone += 1
         if alone >= FAILURES_ALONE:
             self._quarantine(entry, reason)
         else:
-            vessel.failing[entry.name] = _Failing(self._stored, alone)  # the last one in turn
+            vessel.failing[entry.id] = _Failing(self._stored, alone)  # the last one in turn
 
-    def _quarantine(self, entry: AcceptedImage, reason: str) -> None:
+    def _quarantine(self, entry: BacklogRecord, reason: str) -> None:
         with self._store.transaction() as tx:
-            tx.quarantine("in", keys.shore_part(entry.vessel_id, self._site), entry.payload, reason, is_accepted=True)
-            tx.delete_state(entry.name)
-        self._vessel(entry.vessel_id).failing.pop(entry.name, None)
+            tx.quarantine("in", entry.key, entry.payload, reason, is_accepted=True)
         self._on_undecodable(entry, reason)
-
-
-def _vessel_of(name: str) -> str:
-    return name.removeprefix(BACKLOG).partition("/")[0]
+        self._vessel(entry.vessel_id).failing.pop(entry.id, None)
 
 
 def _groups(
-    decoded: Sequence[tuple[AcceptedImage, ReconstructedImage]],
-) -> Iterator[list[tuple[AcceptedImage, ReconstructedImage]]]:
+    decoded: Sequence[tuple[BacklogRecord, ReconstructedImage]],
+) -> Iterator[list[tuple[BacklogRecord, ReconstructedImage]]]:
     """Yield images in groups of at most `BATCH_BYTES` of pixels, at least one each."""
-    group: list[tuple[AcceptedImage, ReconstructedImage]] = []
+    group: list[tuple[BacklogRecord, ReconstructedImage]] = []
     size_bytes = 0
     for each in decoded:
         size_bytes += len(each[1].pixels.data)

@@ -23,7 +23,8 @@ from sonarpost.archive.journal import JournalRow
 from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.limits import limit
 from sonarpost.logs import kv
-from sonarpost.services.c2.accepted import AcceptedRecords, accepted_fields, payload_of
+from sonarpost.services.c2.accepted import accepted_fields, payload_of
+from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.json_form import ENCODING, json_payload
 from sonarpost.services.c2.query_parameters import QueryParameters, parse_parameters
 
@@ -97,13 +98,13 @@ class QueryService:
     """Queryables of one c2.
 
     Args:
-        records: The accepted records.
+        archive: The archive of c2.
         site: Name of the site in keys.
         count: Increases a health counter.
     """
 
-    def __init__(self, records: AcceptedRecords, site: str, count: Callable[[str, int], None]) -> None:
-        self._records = records
+    def __init__(self, archive: Archive, site: str, count: Callable[[str, int], None]) -> None:
+        self._archive = archive
         self.count = count
         self._declared = (keys.shore_contact_all(site), keys.tasking_state_all(site))
         self._pool = ThreadPoolExecutor(THREADS, "query")
@@ -213,7 +214,7 @@ class QueryService:
 
     def _send_page(self, query: zenoh.Query, parameters: QueryParameters) -> None:
         where = str(query.key_expr)
-        journal = self._records.journal()
+        journal = self._archive.index().journal
         # Before the search: a record that is accepted after it has a higher number.
         archive, last = journal.position()
         if parameters.archive not in ("", archive):
@@ -248,7 +249,7 @@ class QueryService:
 
     def _payload(self, row: JournalRow, parameters: QueryParameters) -> bytes | None:
         try:
-            fields = accepted_fields(self._records.fields(row), row.accepted)
+            fields = accepted_fields(self._archive.fields(row), row.accepted)
             return json_payload(fields, parameters.pixels) if parameters.format == "json" else payload_of(fields)
         except (OSError, BadInputError, ValueError) as error:
             log.warning("Stored record cannot be read", extra=kv(file=row.name, error=str(error)))

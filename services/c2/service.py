@@ -16,6 +16,7 @@ from typing_extensions import override
 
 from sonarpost import keys, wire
 from sonarpost.archive import image_parts
+from sonarpost.archive.backlog import BacklogRecord
 from sonarpost.archive.codebook_transfer import CodebookFetcher
 from sonarpost.archive.decode_worker import DecodeWorker
 from sonarpost.archive.decoder import OTHER_PIXELS
@@ -41,14 +42,13 @@ from sonarpost.messages import (
 from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, ServiceStoppingError, UnitOfWork
 from sonarpost.services.c2 import tasking
-from sonarpost.services.c2.accepted import AcceptedRecords, accepted_fields, payload_of
-from sonarpost.services.c2.archive import Archive, Storage
+from sonarpost.services.c2.accepted import accepted_fields, accepted_payload
+from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
-from sonarpost.services.c2.decoding import BACKLOG, AcceptedImage, BacklogNames, Decoding
+from sonarpost.services.c2.decoding import Decoding
 from sonarpost.services.c2.inputs import inputs
 from sonarpost.services.c2.json_form import ENCODING, json_payload
 from sonarpost.services.c2.queries import QueryService
-from sonarpost.services.c2.shared_archive import SharedArchive
 from sonarpost.services.c2.tasking import Tasking
 
 log = logging.getLogger(__name__)
@@ -95,28 +95,24 @@ class C2Service(Service[C2Config]):
         added = {name: each.configured(config) for name, each in inputs().working().items()}
         self._inputs = {name: each for name, each in added.items() if each is not None}
         super().__init__(platform, config)
-        address = config.database_address()
-        self._archive: Storage = Archive(config) if address is None else SharedArchive(config, address, self._owner())
-        self._accepted = AcceptedRecords(self._archive, config.out_dir, config.site)
-        self._queries = QueryService(self._accepted, config.site, self.count)
+        self._archive = Archive(config, self._owner())
+        self._queries = QueryService(self._archive, config.site, self.count)
         self._retention = Retention(self._apply_retention, self.stopping)
         self._changed = threading.Event()
         self._changed_names: set[str] = set()
         self._changed_lock = threading.Lock()
         self._background_faults: dict[str, str] = {}
         # Of the records that are handled and not committed yet.
-        self._to_publish: list[JournalEntry] = []
         self._uncommitted: dict[str, bytes] = {}
         self._stored_versions = Counter[str]()
-        self._backlog_names = BacklogNames(self.store)
         folder = platform.state_dir / CODEBOOKS
         self.decoding = Decoding(
             self.store,
+            lambda: self._archive.index().backlog,
             [DecodeWorker(config.codebooks, folder, platform.state_dir) for _ in range(config.decode_workers)],
             self._keep_images,
             self._on_undecodable,
             self.stopping,
-            config.site,
         )
         self._codebooks = CodebookFetcher(folder, self.decoding.missing.models, self.decoding.wake, self.stopping)
         self.decoding.missing.on_added = self._codebooks.wake
@@ -201,20 +197,23 @@ class C2Service(Service[C2Config]):
     @override
     def before_accepting(self, records: Sequence[tuple[str, bytes]]) -> None:
         """Commit records to an archive that several c2 share, so that another one can handle them."""
-        self._archive.accept(records)
+        if self._archive.is_shared:
+            self._archive.accept(records)
 
     @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         """Store the record of a vessel, or queue comments and commands for one."""
+        accepted = BacklogRecord(key, effects.payload)
         try:
             self._handle(key, record, effects)
         except (OSError, DeliveryError, MemoryError, ServiceStoppingError):
             raise
         except Exception:
-            self._archive.discard(key, effects.payload)
+            if self._archive.is_shared:
+                self._archive.discard(accepted)
             raise
-        if not isinstance(record, (ImagePart, CodedImage)):
-            self._archive.handled(key, effects.payload)
+        if self._archive.is_shared and not isinstance(record, (ImagePart, CodedImage)):
+            self._archive.finished(accepted)
 
     def _handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
         if isinstance(record, Relayed):
@@ -226,9 +225,9 @@ class C2Service(Service[C2Config]):
             else:
                 self._store_decision(inner, effects)
         elif isinstance(record, CodedImage):
-            self._accept_image(record, effects)
+            self._accept_image(key, record, effects)
         elif isinstance(record, ImagePart):
-            self._accept_image(image_parts.coded_image(record, keys.part_vessel(key), key), effects)
+            self._accept_image(key, image_parts.coded_image(record, keys.part_vessel(key), key), effects)
         else:
             assert isinstance(record, (Comment, Command))
             self._send_to_vessel(keys.tasking_vessel(key), key, record, effects)
@@ -257,17 +256,13 @@ class C2Service(Service[C2Config]):
         effects.count("images_stored" if written.is_new else "images_repeated")
         if written.is_new and written.is_conflict:
             effects.count("images_conflicting")
-        self._to_publish.append(self._accepted.image(image, written.tiff.stem))
 
-    def _accept_image(self, image: CodedImage, effects: UnitOfWork) -> None:
+    def _accept_image(self, key: str, image: CodedImage, effects: UnitOfWork) -> None:
         """Add a coded image to the backlog of the decoder, and publish it in coded form."""
-        vessel = image.vessel_id
-        entry = AcceptedImage(self._backlog_names.next(vessel), vessel, effects.payload)
-        effects.put_state(entry.name, entry.pack())
+        self._archive.queue_image(key, effects.payload, image)
         effects.count("images_accepted")
-        self._to_publish.append(self._accepted.coded(image))
 
-    def _keep_images(self, images: Sequence[ReconstructedImage], entries: Sequence[AcceptedImage]) -> None:
+    def _keep_images(self, images: Sequence[ReconstructedImage], entries: Sequence[BacklogRecord]) -> None:
         """Store and publish decoded images of entries of the backlog.
 
         Raises:
@@ -278,9 +273,8 @@ class C2Service(Service[C2Config]):
         with self.handling():
             written = [self._archive.store_image(image, image.last_frame_utc_s) for image in images]
             for entry in entries:
-                self._archive.handled(keys.shore_part(entry.vessel_id, self.config.site), entry.payload)
-            stored = [self._accepted.image(i, files.tiff.stem) for i, files in zip(images, written, strict=True)]
-            numbers = self._accepted.flush(stored)
+                self._archive.finished(entry)
+            stored = self._archive.flush()
         for image, files in zip(images, written, strict=True):
             self.count("images_stored" if files.is_new else "images_repeated")
             if files.is_new and files.is_conflict:
@@ -291,16 +285,12 @@ class C2Service(Service[C2Config]):
                     "Image decoded with other pixels than on the vessel",
                     extra=kv(vessel=image.vessel_id, codec=image.codec),
                 )
-        self._publish_stored(stored, numbers)
+        self._publish_stored(stored)
         if any(files.is_new for files in written):
             self._retention.wake()
 
-    def _on_undecodable(self, entry: AcceptedImage, reason: str) -> None:
-        key = keys.shore_part(entry.vessel_id, self.config.site)
-        try:
-            self._archive.discard(key, entry.payload)
-        except DeliveryError:
-            self._archive.handled(key, entry.payload)  # with the next images
+    def _on_undecodable(self, entry: BacklogRecord, reason: str) -> None:
+        self._archive.discard(entry)
         self.count("images_undecodable")
         log.error("Image cannot be decoded", extra=kv(vessel=entry.vessel_id, reason=reason))
 
@@ -313,22 +303,21 @@ class C2Service(Service[C2Config]):
                 yield is_held
             finally:
                 if is_held:
-                    self._to_publish.clear()
+                    self._archive.forget()
                     self._uncommitted.clear()
 
     def _store_decision(self, decision: Decision, effects: UnitOfWork) -> None:
         new = self._archive.store_decision(decision)
         effects.count("decisions_stored" if new else "decisions_repeated")
-        self._to_publish.append(self._accepted.decision(decision))
 
     @override
     def before_commit(self) -> None:
-        """Write the files of all records to the disk and publish the records.
+        """Commit all records to the archive, and publish them.
 
         Raises:
             OSError, DeliveryError: They cannot be written; all records are handled again.
         """
-        self._publish_stored(self._to_publish, self._accepted.flush(self._to_publish))
+        self._publish_stored(self._archive.flush())
 
     @override
     def after_commit(self, handled: Sequence[UnitOfWork], superseded: int) -> None:
@@ -353,7 +342,7 @@ class C2Service(Service[C2Config]):
             tasking.reject_conflict(Tasking.unpack(known), record, key)
             return True
         kind, record_id = tasking.kind_and_id(record)
-        return self._is_foreign(vessel, key, record, self._archive.foreign_tasking(vessel, kind, record_id))
+        return self._is_foreign(vessel, key, record, self._archive.index().foreign_tasking(vessel, kind, record_id))
 
     def _is_foreign(self, vessel: str, key: str, record: Comment | Command, payload: bytes | None) -> bool:
         """Return whether another c2 has a record; see `_is_known` for errors."""
@@ -369,7 +358,7 @@ class C2Service(Service[C2Config]):
         kind, record_id = tasking.kind_and_id(record)
         item = Tasking(vessel, kind, payload, changed_utc_s=time.time())
         # Another c2 can have accepted it at the same time.
-        if self._is_foreign(vessel, key, record, self._archive.claim_tasking(item.row(), payload)):
+        if self._is_foreign(vessel, key, record, self._archive.index().claim_tasking(item.row(), payload)):
             effects.count("tasking_repeated")
             return
         priority = COMMENT_PRIORITY if isinstance(record, Comment) else COMMAND_PRIORITY
@@ -426,9 +415,7 @@ class C2Service(Service[C2Config]):
                 if item is None:
                     continue  # not committed yet, or it could not be read
                 try:
-                    self._archive.store_tasking([item.row()])
-                    state = [self._accepted.state(item)]
-                    self._publish_stored(state, self._accepted.number(state))
+                    self._publish_stored([self._archive.store_state(item)])
                 except ServiceStoppingError:
                     raise
                 except Exception as error:  # noqa: BLE001 - the others are published
@@ -485,7 +472,7 @@ class C2Service(Service[C2Config]):
         self.start_thread(self._retention.run, "retention")
         self.start_thread(self._run_verification, "verification")
         self.start_thread(self._publish_states, "tasking")
-        if isinstance(self._archive, SharedArchive):
+        if self._archive.is_shared:
             self.start_thread(self._take_over, "take-over")
         self.start_thread(self.decoding.run, "decoding")
         self.start_thread(lambda: self._codebooks.run(self.session), "codebooks")
@@ -509,13 +496,11 @@ class C2Service(Service[C2Config]):
     def stop(self) -> None:
         """Stop, then close the archive."""
         super().stop()
-        self._accepted.close()
         self._archive.close()
 
     def _apply_retention(self, now_utc_s: float) -> None:
         removed = self._archive.apply_retention(now_utc_s)
         if removed:
-            self._accepted.remove(removed)
             self.count("images_removed", len(removed))
 
     def _run_queries(self) -> None:
@@ -562,22 +547,23 @@ class C2Service(Service[C2Config]):
         """Return the size of the stored images and the number of records queued for vessels."""
         waiting = [q for q in self.store.queues() if q.startswith(CONSUMER)]
         return {
-            "images_undecoded": float(self.store.state_count(BACKLOG)),
+            "images_undecoded": float(self._archive.waiting_count()),
             "images_bytes": float(self._archive.images_bytes()),
             "waiting_for_vessels": float(sum(self.store.queue_depth(queue).records for queue in waiting)),
             **{f"records_{defect}": float(count) for defect, count in self._archive.defect_counts().items()},
         }
 
-    def _publish_stored(self, entries: Sequence[JournalEntry], numbers: Sequence[Accepted]) -> None:
+    def _publish_stored(self, stored: Sequence[tuple[JournalEntry, Accepted]]) -> None:
         """Publish records with their numbers.
 
         Raises:
             ServiceStoppingError: The session was closed: the records are published after the next start.
         """
-        for entry, accepted in zip(entries, numbers, strict=True):
-            fields = accepted_fields(wire.map_of(entry.record), accepted)
+        for entry, accepted in stored:
             encoding = wire.encoding_of(type(entry.record))
-            if not self.publish_payload(entry.key, payload_of(fields), encoding) and self.stopping.is_set():
+            payload = accepted_payload(entry, accepted)
+            if not self.publish_payload(entry.key, payload, encoding) and self.stopping.is_set():
                 raise ServiceStoppingError
             if self.config.json_mirror:
+                fields = accepted_fields(entry.fields, accepted)
                 self.publish_payload(keys.json_mirror(entry.key), json_payload(fields, "png"), ENCODING)

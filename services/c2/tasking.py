@@ -8,7 +8,7 @@ from typing import Final, cast, get_args
 import msgpack
 
 from sonarpost import keys, wire
-from sonarpost.archive.shore_index import TaskingRow
+from sonarpost.archive.rows import TaskingRow
 from sonarpost.errors import PayloadError
 from sonarpost.link.state import unpack_value
 from sonarpost.messages import Command, Comment, DeliveryState, TaskingKind, TaskingState

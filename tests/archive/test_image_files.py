@@ -13,10 +13,9 @@ from builders.record_samples import COMPLETE_IMAGE, DAMAGED_IMAGE
 from builders.record_strategies import images
 from hypothesis import given
 
-from sonarpost.archive.image_files import add_image, image_file_name, stored_image, write_image
+from sonarpost.archive.image_files import image_file_name, stored_image, write_image
 from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import side_car
-from sonarpost.files import AtomicFiles
 from sonarpost.messages import Pixels, ReconstructedImage
 from sonarpost.sonar.image_files import read_image
 
@@ -186,17 +185,3 @@ def test_other_image_of_the_same_name_is_kept(tmp_path):
         assert write_image(tmp_path, image) == (found.tiff, False, True)
     assert write_image(tmp_path, first) == (tmp_path / f"{NAME}.tiff", False, False)
     assert contents(tmp_path) == now
-
-
-def test_conflicting_images_in_one_commit_are_kept(tmp_path):
-    files = AtomicFiles()
-    images = [COMPLETE_IMAGE, shifted(0.4), COMPLETE_IMAGE, shifted(0.4)]
-    written = [add_image(files, tmp_path, image) for image in images]
-    files.commit()
-    assert [(found.is_new, found.is_conflict) for found in written] == [
-        (True, False),
-        (True, True),
-        (False, False),
-        (False, True),
-    ]
-    assert len(contents(tmp_path)) == 6

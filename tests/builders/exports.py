@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from builders.records import decision_record, reconstructed_image
 from sonarpost.archive.image_files import write_image
-from sonarpost.archive.shore_files import decision_file_name
+from sonarpost.archive.shore_files import decision_path
 from sonarpost.export.contacts import ContactSet, ExportContact, ImageSideCar, side_car
 from sonarpost.export.formats import exporters
 from sonarpost.export.live import LiveContacts
@@ -86,10 +86,9 @@ def store(out_dir: Path, *records: ReconstructedImage | Decision) -> Path:
         if isinstance(record, ReconstructedImage):
             write_image(folder, record)
             continue
-        decisions = folder / "decisions"
-        decisions.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(record.model_dump(), indent=1) + "\n"
-        (decisions / decision_file_name(record.decision_id)).write_text(text)
+        path = decision_path(out_dir, record.vessel_id, record.decision_id)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(record.model_dump(), indent=1) + "\n")
     return out_dir
 
 

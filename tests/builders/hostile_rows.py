@@ -456,5 +456,5 @@ ROWS: tuple[Row, ...] = (
         "junk",
         "tests/services/atd_stub/test_input_files.py",
     ),
-    Row(("folder:*_file",), "a file", "junk", "tests/archive/test_shore_database.py"),
+    Row(("folder:*_file",), "a file", "junk", "tests/archive/test_postgresql.py"),
 )

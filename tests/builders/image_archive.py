@@ -72,7 +72,7 @@ class ArchiveLog:
                 self._files[path] = sha256
                 name = record_name(*(fields[n] for n in ("vehicle_id", "image_id", "version", "first_frame_utc_s")))
                 self._history.add("handled", "c2", name, key=self._key, sha256=sha256)
-        with contextlib.closing(sqlite3.connect(f"file:{self._out / 'index.db'}?mode=ro", uri=True)) as db:
+        with contextlib.closing(sqlite3.connect(f"file:{self._out / 'archive.db'}?mode=ro", uri=True)) as db:
             rows = db.execute("SELECT vehicle_id, image_id, version, first_frame_utc_s FROM image").fetchall()
         found = Counter(record_name(*row) for row in rows if self._vehicle in (None, row[0]))
         for name in (found - self._rows).elements():

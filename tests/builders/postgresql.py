@@ -4,14 +4,16 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import count
 from pathlib import Path
 
 import pytest
 
 from builders.common import free_port
-from sonarpost.archive.postgresql import ConnectionPool, DatabaseAddress
+from sonarpost.archive.address import DatabaseAddress
+from sonarpost.archive.postgresql import PostgresDatabase
+from sonarpost.archive.shore_archive import ShoreArchive
 
 USER = "sonarpost"
 TEMPLATE = "with_postgis"
@@ -114,8 +116,15 @@ def database_url(postgresql_server: PostgresServer) -> str:
 
 
 @pytest.fixture
-def database(database_url: str) -> Iterator[ConnectionPool]:
+def database(database_url: str) -> Iterator[PostgresDatabase]:
     """Connections to an empty database."""
-    database = ConnectionPool(DatabaseAddress.parse(database_url))
+    database = PostgresDatabase(DatabaseAddress.parse(database_url))
     yield database
     database.close()
+
+
+def execute(archive: ShoreArchive, statement: str) -> Sequence[Sequence[object]]:
+    """Run a statement in the database of an archive; return its rows."""
+    with archive.database.transaction() as sql:
+        done = sql.exec_driver_sql(statement)
+        return done.all() if done.returns_rows else []

@@ -1,6 +1,8 @@
 """Records of a vessel as c2 receives them, and a subscriber that reads its archive."""
 
 import threading
+import time
+from collections.abc import Iterable
 from typing import Any
 
 import msgpack
@@ -9,9 +11,12 @@ import zenoh
 from builders.common import eventually
 from builders.records import reconstructed_image
 from sonarpost import keys, wire
+from sonarpost.archive.shore_archive import Batch
 from sonarpost.bus.catch_up import AcceptedRecord, CatchUpSubscriber
 from sonarpost.errors import BadInputError, QueryRefusedError
 from sonarpost.messages import Decision, Pixels, ReconstructedImage, Record, Relayed, TaskingState
+from sonarpost.services.c2.accepted import image_entry
+from sonarpost.services.c2.service import C2Service
 
 CONTACTS = "sonarpost/v1/shore/contact/*/*"
 
@@ -32,6 +37,12 @@ def relayed(record: ReconstructedImage | Decision, vessel: str = "", **changes: 
     key = keys.image_reconstructed(vessel) if is_image else keys.contact_decision(vessel)
     fields = {"vessel_id": vessel, "key": key, "payload": wire.encode(record), "relayed_utc_s": 5.0}
     return Relayed.model_validate(fields | changes)
+
+
+def number_images(service: C2Service, images: Iterable[ReconstructedImage]) -> None:
+    """Number images of c2 without their files and their publication."""
+    entries = [image_entry(each, "", service.config.site) for each in images]
+    service._archive.index().write(Batch(numbered=[entry.columns(time.time()) for entry in entries]))
 
 
 def identity(payload: bytes) -> str:

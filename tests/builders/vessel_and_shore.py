@@ -27,14 +27,13 @@ from sonarpost import keys, wire
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig
 from sonarpost.messages import Health, ReconstructedImage
-from sonarpost.services.c2.decoding import BACKLOG
 from sonarpost.stop_signals import EXIT_WITH_PARENT
 
 SHORE = "shore-1"
 PROCESSES = ("router-vessel", "router-shore", "relay", "c2")
 KEY = keys.image_coded(VESSEL)
-UNFINISHED = ("inbox", "outbox", f"state WHERE name LIKE '{BACKLOG}%'")
-"""Rows of a store for records that are not handled, not acknowledged, or (c2) not decoded and stored."""
+UNFINISHED = ("inbox", "outbox")
+"""Rows of a store for records that are not handled or not acknowledged."""
 
 
 @dataclass
@@ -279,7 +278,9 @@ class VesselAndShore:
         return (self.folder / f"{name}.log").read_text(errors="replace")
 
     def database(self, service):
-        return (self.vessel_state if service == "relay" else self.shore_state) / f"{service}.db"
+        """Return the store of a service, or the archive of c2."""
+        folders = {"relay": self.vessel_state, "archive": self.out}
+        return folders.get(service, self.shore_state) / f"{service}.db"
 
     def query(self, service, sql):
         """Return one number of a store, None while it cannot be read."""
@@ -309,6 +310,7 @@ class VesselAndShore:
             self.shore_image_count() >= len(self.expected)
             and self.source.store.outbox_depth() == 0
             and all(self.query(s, f"SELECT COUNT(*) FROM {rows}") == 0 for s in ("relay", "c2") for rows in UNFINISHED)
+            and self.query("archive", "SELECT COUNT(*) FROM backlog") == 0
         )
 
     def assert_all_delivered_once(self):

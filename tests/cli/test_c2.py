@@ -107,7 +107,7 @@ def test_ls_states_class_and_probabilities(capsys, tmp_path):
         archive.store_image(record.model_copy(update={"contact": record.contact.model_copy(update=changes)}), 5.0)
     archive.flush()
     archive.close()
-    rows = {row["image_id"]: row for row in ls(capsys, tmp_path)}
+    rows = {row["image_id"]: row["contact"] for row in ls(capsys, tmp_path)}
     assert {name: rows["AAAA"][name] for name in fields} == fields
     assert [rows["BBBB"][name] for name in fields if name != "atd_confidence"] == ["structure", None, None]
     assert main(["c2", "ls", "--archive", str(tmp_path)]) == 0
@@ -345,6 +345,6 @@ def test_folder_of_a_demo_in_the_current_folder_comes_first(elsewhere, tmp_path,
 def test_folder_is_out_if_nothing_names_one(elsewhere, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("sonarpost.cli.c2.stored.SHORE_CONFIG", tmp_path / "absent.toml")
     assert main(["c2", "ls"]) == 2
-    assert "out/index.db: got 'no such file', expected the index" in capsys.readouterr().err
+    assert "out/archive.db: got 'no such file', expected the archive" in capsys.readouterr().err
     assert main(["c2", "ls", "--config", str(tmp_path / "absent.toml")]) == 2
     assert "absent.toml" in capsys.readouterr().err

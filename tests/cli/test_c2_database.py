@@ -4,17 +4,17 @@ import csv
 import json
 
 import pytest
+from builders.postgresql import execute
 from builders.records import decision_record, reconstructed_image
 
-from sonarpost.archive.journal import Criteria, Journal
-from sonarpost.archive.shore_database import ShoreDatabase
+from sonarpost.archive.journal import Criteria
+from sonarpost.archive.rows import TaskingRow
+from sonarpost.archive.shore_archive import Batch, ShoreArchive
 from sonarpost.archive.shore_files import image_paths
-from sonarpost.archive.shore_index import TaskingRow
 from sonarpost.cli.console import stored_records
 from sonarpost.cli.main import main
 from sonarpost.errors import DatabaseUnavailableError
 from sonarpost.messages import Contact, Pixels
-from sonarpost.services.c2.accepted import AcceptedRecords
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 
@@ -40,13 +40,10 @@ def files(tmp_path):
     archive.store_decision(decision_record("d1", image_id="0002"))
     archive.store_decision(decision_record("d2", image_id="0003"))
     archive.flush()
-    archive.store_tasking(
-        [TaskingRow("vessel-1", "command", "c1", "uuv-1", None, "refine", "expert", 1.0, "delivered", "", 2.0)]
-    )
+    row = TaskingRow("vessel-1", "command", "c1", "uuv-1", None, "refine", "expert", 1.0, "delivered", "", 2.0)
+    archive.index().write(Batch(tasking=[row]))
     index = archive.index()
     removed = [row for row in index.images() if row.image_id == "0005"]
-    for path in image_paths(tmp_path / "out", removed[0]):
-        path.unlink()
     index.mark("removed_utc_s", removed, 9.0)
     index.mark("exported_utc_s", [row for row in index.images() if row.image_id == "0006"], 8.0)
     return archive
@@ -61,7 +58,7 @@ def config(tmp_path, database_url):
 
 @pytest.fixture
 def archive(database):
-    return ShoreDatabase(database)
+    return ShoreArchive(database)
 
 
 def test_migration_copies_everything_once(files, config, archive, capsys):
@@ -87,36 +84,35 @@ def test_migration_copies_everything_once(files, config, archive, capsys):
 
 def test_migration_keeps_the_numbers_of_the_journal(files, config, archive, tmp_path, capsys):
     """A subscriber's cursor stays valid; records that c2 has numbered after the first copy keep their numbers, too."""
-    records = AcceptedRecords(files, tmp_path / "out", "shore")
-    first = records.journal()
-    assert isinstance(first, Journal)
+    first = files.index().journal
     before = first.position()
-    assert before[1] == COUNT + 3  # one image is removed
+    assert before[1] == COUNT + 4
     assert main(["c2", "migrate", "--config", str(config)]) == 0
+    # One image is removed.
     assert f"numbers for queries {COUNT + 3};" in capsys.readouterr().out
-    assert archive.journal().position() == before
-    [later] = records.number([records.decision(decision_record("d9", image_id="0003"))])
+    assert archive.journal.position() == before
+    files.store_decision(decision_record("d9", image_id="0003"))
+    [(_, later)] = files.flush()
     assert main(["c2", "migrate", "--config", str(config)]) == 0
     assert "numbers for queries 1;" in capsys.readouterr().out
     keys = first.known_keys()
     expected = [(row.accepted, row.fields, row.name) for row in first.page(keys, Criteria(), 0, 1000)]
-    found = [(row.accepted, row.fields, row.name) for row in archive.journal().page(keys, Criteria(), 0, 1000)]
+    found = [(row.accepted, row.fields, row.name) for row in archive.journal.page(keys, Criteria(), 0, 1000)]
     assert found == expected
     assert found[-1][0] == later
-    records.close()
 
 
 def test_interrupted_migration_is_completed_by_the_next_one(files, config, archive, monkeypatch):
-    write = ShoreDatabase.write
+    write = ShoreArchive.write
     calls: list[int] = []
 
     def fails_second(self, *arguments):
         calls.append(1)
         if len(calls) == 2:
             raise DatabaseUnavailableError("database: connection lost")
-        write(self, *arguments)
+        return write(self, *arguments)
 
-    monkeypatch.setattr(ShoreDatabase, "write", fails_second)
+    monkeypatch.setattr(ShoreArchive, "write", fails_second)
     assert main(["c2", "migrate", "--config", str(config)]) == 2
     assert 0 < len(archive.images()) < COUNT
     assert main(["c2", "migrate", "--config", str(config)]) == 0
@@ -131,15 +127,14 @@ def test_damaged_and_different_records_are_rejected_by_name(files, config, archi
     assert main(["c2", "migrate", "--config", str(config)]) == 1
     captured = capsys.readouterr()
     assert "rejected 2" in captured.out
-    assert "_0009_v1: the files differ from the index" in captured.err
+    assert "_0009_v1: the files differ from their digests" in captured.err
     assert "_0010_v1.png" in captured.err
     assert len(archive.images()) == COUNT - 1
 
 
-def test_change_in_the_database_is_found_by_the_comparison(files, config, archive, database, capsys):
+def test_change_in_the_database_is_found_by_the_comparison(files, config, archive, capsys):
     assert main(["c2", "migrate", "--config", str(config)]) == 0
-    with database.transaction() as sql:
-        sql.rows("UPDATE file SET content = 'x' WHERE suffix = '.png' AND name LIKE '%0007%'")
+    execute(archive, "UPDATE file SET content = 'x' WHERE suffix = '.png' AND name LIKE '%%0007%%'")
     assert main(["c2", "migrate", "--config", str(config)]) == 1
     assert "0007_v1: the files in the database differ" in capsys.readouterr().err
 
@@ -197,7 +192,7 @@ def test_files_of_an_image_are_copied_from_the_database(places, tmp_path):
 
 
 def test_console_reads_the_records_of_the_database(places, tmp_path, database_url):
-    from sonarpost.archive.postgresql import DatabaseAddress
+    from sonarpost.archive.address import DatabaseAddress
 
     def read(place):
         return sorted(record.model_dump_json() for record in stored_records(place))

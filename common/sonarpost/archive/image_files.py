@@ -11,7 +11,7 @@ import base64
 import binascii
 import hashlib
 import json
-from collections.abc import Set
+from collections.abc import Mapping, Set
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,8 @@ from pydantic import ValidationError
 
 from sonarpost.archive.retention import remove_files, vehicle_source
 from sonarpost.errors import StoredFileError
-from sonarpost.export.contacts import ImageSideCar, side_car
+from sonarpost.export.contacts import ImageSideCar
+from sonarpost.export.contacts import side_car as side_car_fields
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import Pixels, ReconstructedImage
 from sonarpost.sonar.image_decoding import GreyImage
@@ -88,7 +89,7 @@ def remove_old_images(folder: Path, now_utc_s: float, retain_days: float, max_by
 
 def side_car_text(image: ReconstructedImage) -> bytes:
     """Return the content of the JSON file as bytes."""
-    return (json.dumps(side_car(image), indent=1) + "\n").encode()
+    return (json.dumps(side_car_fields(image), indent=1) + "\n").encode()
 
 
 def stored_image(content: bytes, pixels: GreyImage, where: str) -> ReconstructedImage:
@@ -131,52 +132,26 @@ def write_image(folder: Path, image: ReconstructedImage) -> WrittenImage:
     Raises:
         OSError: The folder cannot be written, for example because of a full disk.
     """
-    files = AtomicFiles()
-    written = add_image(files, folder, image)
-    files.commit()
-    return written
-
-
-def add_image(files: AtomicFiles, folder: Path, image: ReconstructedImage) -> WrittenImage:
-    """Add the files of an image to others that are committed together; see `write_image`.
-
-    Raises:
-        OSError: The folder cannot be written; none of the three files is added.
-    """
     text = side_car_text(image)
     plain = folder / f"{image_file_name(image)}.json"
     other = plain.with_name(f"{other_name(plain.stem, text)}.json")
     for path in (plain, other):
-        if _is_stored(files, path, text):
+        if _content(path) == text and all(path.with_suffix(suffix).is_file() for suffix in (".tiff", ".png")):
             return WrittenImage(path.with_suffix(".tiff"), is_new=False, is_conflict=path == other)
-    stored = files.text_of(plain) or _content(plain)
-    is_other = _is_other_image(stored, image, text)
-    if is_other and _same_version(stored, image):
-        if PREVIEW_NOTE in image.notes:
-            return WrittenImage(plain.with_suffix(".tiff"), is_new=False, is_conflict=False)
-        if PREVIEW_NOTE in _notes(stored):
-            is_other = False  # the whole replaces its preview
-    is_conflict = other.exists() or is_other
-    sidecar = other if is_conflict else plain
-    tiff, png = sidecar.with_suffix(".tiff"), sidecar.with_suffix(".png")
+    is_conflict = other.exists() or _is_other_image(_content(plain), image, text)
+    side_car = other if is_conflict else plain
+    tiff, png = side_car.with_suffix(".tiff"), side_car.with_suffix(".png")
     folder.mkdir(parents=True, exist_ok=True)
     pixels = image.pixels.to_array()
-    before = len(files)
+    files = AtomicFiles()
     try:
         files.add(tiff, tiff_bytes(tiff, pixels))
         files.add(png, png_bytes(png, pixels))
-        files.add(sidecar, text, last=True)
-    except BaseException:
-        files.drop_from(before)
-        raise
+        files.add(side_car, text, last=True)
+        files.commit()
+    finally:
+        files.drop_from(0)
     return WrittenImage(tiff, is_new=True, is_conflict=is_conflict)
-
-
-def _is_stored(files: AtomicFiles, sidecar: Path, text: bytes) -> bool:
-    if (added := files.text_of(sidecar)) is not None:
-        return added == text
-    complete = all(sidecar.with_suffix(suffix).is_file() for suffix in (".tiff", ".png"))
-    return _content(sidecar) == text and complete
 
 
 def _content(path: Path) -> bytes | None:
@@ -194,21 +169,7 @@ def _is_other_image(content: bytes | None, image: ReconstructedImage, text: byte
     return isinstance(fields, dict) and fields.get("type") == image.TYPE
 
 
-def _fields(content: bytes | None) -> dict[str, object]:
-    try:
-        fields = json.loads(content or b"")
-    except ValueError:
-        return {}
-    return fields if isinstance(fields, dict) else {}
-
-
-def _notes(content: bytes | None) -> tuple[object, ...]:
-    notes = _fields(content).get("notes")
-    return tuple(notes) if isinstance(notes, list) else ()
-
-
-def _same_version(content: bytes | None, image: ReconstructedImage) -> bool:
+def same_version(fields: Mapping[str, object], image: ReconstructedImage) -> bool:
     """Return whether a side-car belongs to the same version of the same image, by identifiers and time."""
     names = ("vessel_id", "vehicle_id", "image_id", "version", "first_frame_utc_s")
-    fields = _fields(content)
     return all(fields.get(name) == getattr(image, name) for name in names)

@@ -6,41 +6,21 @@ import tempfile
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
+from sonarpost.archive.address import SCHEME, DatabaseAddress
 from sonarpost.archive.image_files import SUFFIXES
-from sonarpost.archive.postgresql import SCHEME, ConnectionPool, DatabaseAddress
-from sonarpost.archive.shore_database import ShoreDatabase
-from sonarpost.archive.shore_files import decision_path, image_paths
-from sonarpost.archive.shore_index import DecisionRow, ImageRow, MarkColumn, ShoreIndex, TaskingRow
-from sonarpost.errors import StoredFileError
-from sonarpost.files import read_regular
-from sonarpost.sonar.image_decoding import MAX_FILE_BYTES
+from sonarpost.archive.rows import DecisionRow, ImageRow
+from sonarpost.archive.shore_files import decision_name
+
+if TYPE_CHECKING:
+    from sonarpost.archive.shore_archive import ShoreArchive
 
 ArchivePlace = Path | DatabaseAddress
 """Folder of c2, or address of its database."""
 COMMAND_TIMEOUT_S = 60.0
 PART_IMAGES = 64
 """Number of images in one part of a database."""
-
-
-class RecordReader(Protocol):
-    """Rows of the stored records; `ShoreIndex` and `ShoreDatabase`."""
-
-    def images(self, *, removed: bool = False) -> list[ImageRow]:
-        """Return all versions of all images, oldest first; removed ones only if `removed`."""
-
-    def decisions(self) -> list[DecisionRow]:
-        """Return all decisions, oldest first."""
-
-    def tasking(self) -> list[TaskingRow]:
-        """Return all comments and commands, oldest first."""
-
-    def mark(self, column: MarkColumn, images: Iterable[ImageRow], at_utc_s: float) -> None:
-        """Mark images as exported or removed."""
-
-    def close(self) -> None:
-        """Close the index or the connections."""
 
 
 def place_of(text: str, where: str) -> ArchivePlace:
@@ -52,9 +32,34 @@ def place_of(text: str, where: str) -> ArchivePlace:
     return DatabaseAddress.parse(text, where=where) if text.startswith(SCHEME) else Path(text)
 
 
+def open_archive(
+    place: ArchivePlace, *, site: str = "", owner: str = "", timeout_s: float = 5.0, writable: bool = True
+) -> ShoreArchive:
+    """Return an archive; it is opened when it is first used.
+
+    Args:
+        place: Folder or address of the archive.
+        site: Name of the site; empty for any.
+        owner: Identity of this c2 among those that share a database.
+        timeout_s: Time limit to connect to a server, and to wait for its answer.
+        writable: Whether to create the archive.
+
+    Raises:
+        ConfigError: There is no driver for the server.
+    """
+    # Imported here: they take 0.3 s, and few commands need them.
+    from sonarpost.archive.database import SqliteDatabase  # noqa: PLC0415
+    from sonarpost.archive.postgresql import PostgresDatabase  # noqa: PLC0415
+    from sonarpost.archive.shore_archive import ShoreArchive  # noqa: PLC0415
+
+    if isinstance(place, Path):
+        return ShoreArchive(SqliteDatabase(place, site=site, writable=writable), place)
+    return ShoreArchive(PostgresDatabase(place, timeout_s, site=site, writable=writable), owner=owner)
+
+
 @contextmanager
-def open_reader(place: ArchivePlace, *, writable: bool = False) -> Iterator[RecordReader]:
-    """Open the records of an archive.
+def open_reader(place: ArchivePlace, *, writable: bool = False) -> Iterator[ShoreArchive]:
+    """Open an existing archive, for a command.
 
     Args:
         place: Folder or address of the archive.
@@ -64,24 +69,15 @@ def open_reader(place: ArchivePlace, *, writable: bool = False) -> Iterator[Reco
         StoredFileError: There is no archive of this version.
         DeliveryError, OSError: It cannot be read.
     """
-    if isinstance(place, Path):
-        with closing(ShoreIndex(place, writable=writable)) as index:
-            yield index
-        return
-    with closing(open_database(place)) as database:
-        yield database
-
-
-def open_database(address: DatabaseAddress) -> ShoreDatabase:
-    """Open an existing archive in a database, for a command.
-
-    Raises:
-        StoredFileError: It has no archive of this version.
-        DatabaseUnavailableError: The server is not reached.
-    """
-    database = ShoreDatabase(ConnectionPool(address, COMMAND_TIMEOUT_S), writable=False)
-    database.prepare()
-    return database
+    if isinstance(place, DatabaseAddress):
+        writable = False
+    elif writable:
+        with open_reader(place):
+            pass  # there is one
+    archive = open_archive(place, timeout_s=COMMAND_TIMEOUT_S, writable=writable)
+    with closing(archive):
+        archive.database.prepare()
+        yield archive
 
 
 def read_image_files(place: ArchivePlace, row: ImageRow) -> dict[str, bytes]:
@@ -91,19 +87,8 @@ def read_image_files(place: ArchivePlace, row: ImageRow) -> dict[str, bytes]:
         StoredFileError: A file is missing or cannot be read.
         DatabaseUnavailableError: The server is not reached.
     """
-    if isinstance(place, Path):
-        files = {}
-        for path in image_paths(place, row):
-            try:
-                files[path.name] = read_regular(path, MAX_FILE_BYTES)
-            except OSError as error:
-                raise StoredFileError(str(path), "", error.strerror or str(error), "a readable file of c2") from error
-        return files
-    with closing(open_database(place)) as database:
-        found = database.image_files(row.vessel_id, row.name)
-    if not found:
-        raise StoredFileError(str(place), "name", row.name, "an image whose files are stored")
-    return {f"{row.name}{suffix}": content for suffix, content in found.items()}
+    with open_reader(place) as archive:
+        return {f"{row.name}{suffix}": data for suffix, data in archive.read_files(row.vessel_id, row.name).items()}
 
 
 @contextmanager
@@ -121,15 +106,9 @@ def as_folder(place: ArchivePlace, suffixes: Collection[str] = SUFFIXES) -> Iter
     if isinstance(place, Path):
         yield place
         return
-    with (
-        closing(open_database(place)) as database,
-        tempfile.TemporaryDirectory(prefix="sonarpost-archive-") as name,
-    ):
-        folder = Path(name)
-        for row in database.images():
-            _copy_image(database, row, folder, suffixes)
-        _copy_decisions(database, folder)
-        yield folder
+    with open_reader(place) as archive, tempfile.TemporaryDirectory(prefix="sonarpost-archive-") as name:
+        _copy(archive, archive.images(), archive.decisions(), Path(name), suffixes)
+        yield Path(name)
 
 
 def archive_parts(place: ArchivePlace) -> Iterator[Path]:
@@ -142,27 +121,27 @@ def archive_parts(place: ArchivePlace) -> Iterator[Path]:
     if isinstance(place, Path):
         yield place
         return
-    with closing(open_database(place)) as database:
-        rows = database.images()
-        for first in range(0, len(rows), PART_IMAGES):
+    with open_reader(place) as archive:
+        rows = archive.images()
+        for first in range(0, len(rows) + 1, PART_IMAGES):
+            part = rows[first : first + PART_IMAGES]
+            is_last = first + PART_IMAGES > len(rows)
             with tempfile.TemporaryDirectory(prefix="sonarpost-archive-") as name:
-                for row in rows[first : first + PART_IMAGES]:
-                    _copy_image(database, row, Path(name), SUFFIXES)
+                _copy(archive, part, archive.decisions() if is_last else (), Path(name), SUFFIXES)
                 yield Path(name)
-        with tempfile.TemporaryDirectory(prefix="sonarpost-archive-") as name:
-            _copy_decisions(database, Path(name))
-            yield Path(name)
 
 
-def _copy_image(database: ShoreDatabase, row: ImageRow, folder: Path, suffixes: Collection[str]) -> None:
-    (folder / row.vessel_id).mkdir(exist_ok=True)
-    for suffix, content in database.image_files(row.vessel_id, row.name).items():
-        if suffix in suffixes:
-            (folder / row.vessel_id / f"{row.name}{suffix}").write_bytes(content)
-
-
-def _copy_decisions(database: ShoreDatabase, folder: Path) -> None:
-    for decision in database.decisions():
-        path = decision_path(folder, decision.vessel_id, decision.decision_id)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(database.decision_content(decision))
+def _copy(
+    archive: ShoreArchive,
+    images: Iterable[ImageRow],
+    decisions: Iterable[DecisionRow],
+    folder: Path,
+    suffixes: Collection[str],
+) -> None:
+    names = [(row.vessel_id, row.name, [s for s in SUFFIXES if s in suffixes]) for row in images]
+    names += [(row.vessel_id, decision_name(row.decision_id), [SUFFIXES[0]]) for row in decisions]
+    for vessel_id, name, wanted in names:
+        for suffix, content in archive.read_files(vessel_id, name, wanted).items():
+            path = folder / vessel_id / f"{name}{suffix}"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)

@@ -1,4 +1,4 @@
-"""Files that c2 stores: paths, rows for the index, and retention."""
+"""Files of an archive with a folder: paths, writing, comparison, records of existing files; and retention."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from sonarpost.archive.image_files import SUFFIXES, image_file_name
+from sonarpost.archive.image_files import SUFFIXES, image_file_name, stored_image
 from sonarpost.archive.retention import Stored, select_for_removal
-from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex, Verified
-from sonarpost.errors import StoredFileError
-from sonarpost.export.contacts import DECISIONS, ImageSideCar
-from sonarpost.files import read_regular
+from sonarpost.archive.rows import DecisionRow, Fault, ImageRow
+from sonarpost.errors import BadInputError, StoredFileError
+from sonarpost.export.contacts import DECISIONS
+from sonarpost.files import AtomicFiles, read_regular
 from sonarpost.limits import limit
 from sonarpost.logs import kv
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.sonar.image_decoding import MAX_FILE_BYTES
+from sonarpost.sonar.image_files import read_image
 
 log = logging.getLogger(__name__)
 
@@ -32,9 +33,35 @@ def image_paths(out_dir: Path, row: ImageRow) -> tuple[Path, ...]:
     return tuple(out_dir / row.vessel_id / f"{row.name}{suffix}" for suffix in SUFFIXES)
 
 
+def decision_name(decision_id: str) -> str:
+    """Return the name of a decision's file without suffix, in the vessel's folder.
+
+    The identifier is external text: only its hexadecimal form is safe as a file name. `RecordId` limits it to 64
+    characters, so that the name is not too long for any file system.
+    """
+    return f"{DECISIONS}/{decision_id.encode().hex()}"
+
+
 def decision_path(out_dir: Path, vessel_id: str, decision_id: str) -> Path:
     """Return the path of a decision's file."""
-    return out_dir / vessel_id / DECISIONS / decision_file_name(decision_id)
+    return out_dir / vessel_id / f"{decision_name(decision_id)}.json"
+
+
+def write_files(out_dir: Path, files: Iterable[tuple[str, str, str, bytes]]) -> None:
+    """Write files, each as vessel, name, suffix and content; the JSON file of an image after its others.
+
+    Raises:
+        OSError: They cannot be written; each is complete or absent.
+    """
+    written = AtomicFiles()
+    try:
+        for vessel_id, name, suffix, content in files:
+            path = out_dir / vessel_id / f"{name}{suffix}"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            written.add(path, content, last=suffix == SUFFIXES[0])
+        written.commit()
+    finally:
+        written.drop_from(0)
 
 
 def files_digest(paths: Iterable[Path]) -> str:
@@ -51,8 +78,8 @@ def decision_text(decision: Decision) -> bytes:
     return (json.dumps(decision.model_dump(), indent=1) + "\n").encode()
 
 
-def verify_files(out_dir: Path, row: ImageRow | DecisionRow) -> Verified:
-    """Compare the files of a row with the index: existence and digests."""
+def verify_files(out_dir: Path, row: ImageRow | DecisionRow) -> Fault:
+    """Compare the files of a row with its digests; return what differs."""
     if isinstance(row, ImageRow):
         paths = image_paths(out_dir, row)
     else:
@@ -60,61 +87,29 @@ def verify_files(out_dir: Path, row: ImageRow | DecisionRow) -> Verified:
     try:
         found = files_digest(paths)
     except FileNotFoundError:
-        return Verified(row, "missing")
+        return "missing"
     except OSError as error:
         log.debug("Stored file cannot be read", extra=kv(file=paths[0], error=str(error)))
-        return Verified(row, "unreadable")
-    return Verified(row, "" if found == row.files_sha256 else "changed")
-
-
-def decision_file_name(decision_id: str) -> str:
-    """Return the file name of a decision.
-
-    The identifier is external text: only its hexadecimal form is safe as a file name. `RecordId` limits it to 64
-    characters, so that the name is not too long for any file system.
-    """
-    return f"{decision_id.encode().hex()}.json"
-
-
-def image_row(
-    out_dir: Path,
-    name: str,
-    image: ReconstructedImage | ImageSideCar,
-    relayed_utc_s: float | None,
-    accepted_utc_s: float,
-) -> ImageRow:
-    """Return the index row of an image whose files are written.
-
-    Raises:
-        OSError: A file is missing.
-    """
-    folder = out_dir / image.vessel_id
-    contents = [read_regular(folder / f"{name}{suffix}", MAX_FILE_BYTES) for suffix in SUFFIXES]
-    return row_of_image(name, image, relayed_utc_s, accepted_utc_s, contents)
+        return "unreadable"
+    return "" if found == row.files_sha256 else "changed"
 
 
 def row_of_image(
     name: str,
-    image: ReconstructedImage | ImageSideCar,
+    image: ReconstructedImage,
     relayed_utc_s: float | None,
     accepted_utc_s: float,
     contents: Sequence[bytes],
 ) -> ImageRow:
-    """Return the index row of an image.
+    """Return the row of an image.
 
     Args:
         name: File name without suffix.
-        image: The image, or its side-car.
+        image: The image.
         relayed_utc_s: See `ImageRow`.
         accepted_utc_s: See `ImageRow`.
         contents: Content of its files, in the order of `SUFFIXES`.
     """
-    height_px, width_px = (
-        (image.height_px, image.width_px)
-        if isinstance(image, ImageSideCar)
-        else (image.pixels.height_px, image.pixels.width_px)
-    )
-    contact = image.contact
     return ImageRow(
         vessel_id=image.vessel_id,
         name=name,
@@ -127,34 +122,15 @@ def row_of_image(
         accepted_utc_s=accepted_utc_s,
         complete=image.complete,
         missing_fraction=image.missing_fraction,
-        height_px=height_px,
-        width_px=width_px,
+        height_px=image.pixels.height_px,
+        width_px=image.pixels.width_px,
         codec=image.codec,
-        lat_deg=contact.lat_deg if contact else None,
-        lon_deg=contact.lon_deg if contact else None,
-        atd_class=contact.atd_class if contact else None,
-        atd_confidence=contact.atd_confidence if contact else None,
         size_bytes=sum(max(len(content), MIN_FILE_BYTES) for content in contents),
+        contact=image.contact,
         conflict=name != image_file_name(image),
         files_sha256=" ".join(hashlib.sha256(content).hexdigest() for content in contents),
         despeckle_strength=image.despeckle_strength,
-        p_mine_like=contact.p_mine_like if contact else None,
-        p_other_object=contact.p_other_object if contact else None,
     )
-
-
-def index_missing_files(out_dir: Path, index: ShoreIndex) -> int:
-    """Add files that are not in the index; return the number of rows.
-
-    An unreadable file is logged and ignored.
-
-    Raises:
-        OSError: The index or a folder cannot be read or written.
-    """
-    rows: list[ImageRow | DecisionRow] = [*_missing_images(out_dir, index), *_missing_decisions(out_dir, index)]
-    if rows:
-        index.put(rows)
-    return len(rows)
 
 
 def remove_temporary_files(out_dir: Path) -> int:
@@ -171,25 +147,24 @@ def remove_temporary_files(out_dir: Path) -> int:
     return count
 
 
-def _missing_images(out_dir: Path, index: ShoreIndex) -> Iterator[ImageRow]:
-    for path in sorted(out_dir.glob("*/[!.]*.json")):
-        try:
-            if index.has_image(path.parent.name, path.stem):
-                continue
-            side_car = ImageSideCar.model_validate_json(read_regular(path, MAX_FILE_BYTES))
-            yield image_row(out_dir, path.stem, side_car, None, path.stat().st_mtime)
-        except (ValueError, OSError) as error:  # a name that is not UTF-8 is a ValueError too
-            log.error("Stored image cannot be read", extra=kv(file=path, reason=str(error)[:200]))
+def stored_records(out_dir: Path) -> Iterator[tuple[ReconstructedImage | Decision, float]]:
+    """Yield the records of the files of a folder and their times, for an archive that was lost; oldest first.
 
+    An unreadable file is logged and ignored.
 
-def _missing_decisions(out_dir: Path, index: ShoreIndex) -> Iterator[DecisionRow]:
-    for path in sorted(out_dir.glob(f"*/{DECISIONS}/[!.]*.json")):
+    Raises:
+        OSError: A folder cannot be read.
+    """
+    paths = [*out_dir.glob("*/[!.]*.json"), *out_dir.glob(f"*/{DECISIONS}/[!.]*.json")]
+    for utc_s, path in sorted((path.lstat().st_mtime, path) for path in paths):
         try:
-            decision = Decision.model_validate_json(read_regular(path, MAX_FILE_BYTES))
-            if not index.has_decision(decision.vessel_id, decision.decision_id):
-                yield DecisionRow.of(decision, path.stat().st_mtime, files_digest([path]))
-        except (ValueError, OSError) as error:  # a name that is not UTF-8 is a ValueError too
-            log.error("Stored decision cannot be read", extra=kv(file=path, reason=str(error)[:200]))
+            content = read_regular(path, MAX_FILE_BYTES)
+            if path.parent.name == DECISIONS:
+                yield Decision.model_validate_json(content), utc_s
+            else:
+                yield stored_image(content, read_image(path.with_suffix(".tiff")), str(path)), utc_s
+        except (ValueError, OSError, BadInputError) as error:  # a name that is not UTF-8 is a ValueError too
+            log.error("Stored record cannot be read", extra=kv(file=path, reason=str(error)[:200]))
 
 
 def select_images(

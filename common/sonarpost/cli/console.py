@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from sonarpost.archive.image_files import stored_image
 from sonarpost.archive.reader import ArchivePlace, as_folder, place_of
-from sonarpost.archive.shore_index import FILE_NAME as FILE_NAME_OF_INDEX
+from sonarpost.archive.rows import FILE_NAME as ARCHIVE_FILE_NAME
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.shared import flag, option, print_rejected
 from sonarpost.config import load
@@ -133,7 +133,7 @@ def _run_view(parsed: argparse.Namespace) -> int:
     from sonarpost.services.console.state import ConsoleState  # noqa: PLC0415
 
     place = place_of(parsed.view, "console --view")
-    if isinstance(place, Path) and not (place / FILE_NAME_OF_INDEX).is_file():
+    if isinstance(place, Path) and not (place / ARCHIVE_FILE_NAME).is_file():
         raise ConfigError("console", "--view", parsed.view, "a folder of c2, with its index, or its database")
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sonarpost-view-")))

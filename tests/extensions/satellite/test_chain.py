@@ -261,6 +261,7 @@ def test_records_are_committed_to_a_shared_archive_before_the_message_is_accepte
         if len(accepted) == 1:
             raise DatabaseUnavailableError("database: away")
 
+    monkeypatch.setattr(c2._archive, "is_shared", True)
     monkeypatch.setattr(c2._archive, "accept", accept)
     assert deliver(gateway, IMEI, message(0, decision("d1"))) == 503
     assert (c2.store.inbox_depth(), c2.store.state_names("short/")) == (0, ())

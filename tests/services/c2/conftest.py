@@ -3,12 +3,10 @@
 import pytest
 from builders.shore import Reader
 
-from sonarpost.archive.postgresql import DatabaseAddress
 from sonarpost.services.c2 import queries
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
-from sonarpost.services.c2.shared_archive import SharedArchive
 
 
 @pytest.fixture
@@ -31,16 +29,13 @@ def open_files(out):
 
 
 @pytest.fixture(params=["files", pytest.param("postgresql", marks=pytest.mark.system)])
-def open_archive(request, open_files):
+def open_archive(request, out):
     """Opens archives of both kinds."""
-    if request.param == "files":
-        yield open_files
-        return
-    url = request.getfixturevalue("database_url")
+    url = None if request.param == "files" else request.getfixturevalue("database_url")
     made = []
 
     def open_(**options):
-        made.append(SharedArchive(C2Config(database=url, **options), DatabaseAddress.parse(url), "c2-a"))
+        made.append(Archive(C2Config(out_dir=out, database=url, **options), "c2-a"))
         made[-1].open()
         return made[-1]
 

@@ -12,15 +12,17 @@ from builders.common import eventually
 
 from sonarpost import keys, wire
 from sonarpost.archive import decode_worker
+from sonarpost.archive.backlog import BacklogRecord
 from sonarpost.archive.decode_worker import Decoded, DecodeWorker
 from sonarpost.archive.decoder import Decoder
+from sonarpost.archive.reader import open_archive
+from sonarpost.archive.shore_archive import Batch
 from sonarpost.codec.registry import default_registry
 from sonarpost.delivery.store import Store
-from sonarpost.delivery.transaction import Transaction
-from sonarpost.errors import DatabaseUnavailableError, DeliveryError, RejectedByDatabaseError
+from sonarpost.errors import DatabaseUnavailableError, RejectedByDatabaseError
 from sonarpost.messages import ImagePart
 from sonarpost.services.c2 import decoding
-from sonarpost.services.c2.decoding import AcceptedImage, BacklogNames, Decoding
+from sonarpost.services.c2.decoding import Decoding
 
 MACHINE = Decoded(reason="killed", failure="machine")
 CRASH = Decoded(reason="crashed", failure="crash")
@@ -31,23 +33,27 @@ class Backlog:
 
     def __init__(self, folder, workers=1):
         self.store = Store(folder / "c2.db")
-        self.names = BacklogNames(self.store)
+        self.archive = open_archive(folder)
         self.stopping = threading.Event()
         self.tried, self.stored, self.quarantined = [], [], []
         self.faults, self.alone = set(), []
         self.failing = lambda _: None
         self.refusing = lambda _: None
         self.decoding = Decoding(
-            self.store, [self] * workers, self._keep, lambda e, _: self._quarantined(e), self.stopping, "shore-9"
+            self.store,
+            lambda: self.archive.backlog,
+            [self] * workers,
+            self._keep,
+            lambda e, _: self._quarantined(e),
+            self.stopping,
         )
         self._decoder = Decoder(())
 
     def add(self, vessel, *image_ids):
-        with self.store.transaction() as tx:
-            for image_id in image_ids:
-                part = ImagePart(u="uuv-1", i=image_id, n=1, t=1.7e9)
-                name = self.names.next(vessel)
-                tx.put_state(name, AcceptedImage(name, vessel, wire.encode(part)).pack())
+        parts = [ImagePart(u="uuv-1", i=image_id, n=1, t=1.7e9) for image_id in image_ids]
+        key = keys.shore_part(vessel, "shore-9")
+        for part in parts:
+            self.archive.write(Batch(waiting=[BacklogRecord(key, wire.encode(part), vessel)]))
         self.decoding.wake()
 
     def decode(self, image):
@@ -60,10 +66,12 @@ class Backlog:
         for image in images:
             if error := self.refusing(f"{image.vessel_id}/{image.image_id}"):
                 raise error
+        self.archive.write(Batch(finished=entries))
         self.stored += [f"{image.vessel_id}/{image.image_id}" for image in images]
 
     def _quarantined(self, entry):
-        self.quarantined.append(f"{entry.vessel_id}/{entry.coded_image().image_id}")
+        self.archive.backlog.discard([entry])
+        self.quarantined.append(f"{entry.vessel_id}/{decoding.coded_image(entry).image_id}")
 
     def close(self):
         """As a worker: nothing to end."""
@@ -79,7 +87,7 @@ class Backlog:
             thread.join()
 
     def waiting(self):
-        return self.store.state_count(decoding.BACKLOG)
+        return self.archive.backlog.waiting_count()
 
 
 @pytest.fixture
@@ -87,7 +95,7 @@ def backlog(tmp_path, monkeypatch):
     for name in ("RETRY_S", "MAX_RETRY_S", "MAX_PAUSE_S"):
         monkeypatch.setattr(decoding, name, 0.0)
     made = Backlog(tmp_path)
-    with closing(made.store):
+    with closing(made.store), closing(made.archive):
         yield made
 
 
@@ -209,36 +217,11 @@ def test_pause_after_a_crash_does_not_depend_on_other_images_of_the_batch(backlo
     assert backlog.decoding._vessel("vessel-2").retry_at_s - now_s == decoding.PAUSE_FACTOR * 2.0
 
 
-def test_images_that_cannot_be_removed_from_the_backlog_are_decoded_again(backlog, monkeypatch):
-    delete = Transaction.delete_state
-    left = 1
-
-    def failing(tx, name):
-        nonlocal left
-        left -= 1
-        if left >= 0:
-            raise DeliveryError("disk full")
-        delete(tx, name)
-
-    monkeypatch.setattr(Transaction, "delete_state", failing)
-    backlog.add("vessel-1", *ids(2))
-    backlog.run(lambda: backlog.waiting() == 0)
-    assert set(backlog.stored) == {"vessel-1/0001", "vessel-1/0002"}
-    assert backlog.store.refused_count() == 0
-
-
-def test_entry_that_cannot_be_read_costs_itself_only(backlog):
-    with backlog.store.transaction() as tx:
-        tx.put_state(backlog.names.next("vessel-1"), b"\xc1")
-    backlog.add("vessel-1", "0001")
-    backlog.run(lambda: len(backlog.stored) == 1)
-    assert (backlog.waiting(), backlog.store.states_discarded) == (0, 1)
-
-
 def test_batches_are_limited_by_their_pixels(backlog, monkeypatch):
     sizes = []
     monkeypatch.setattr(decoding, "BATCH_BYTES", 2 * 16 * 16)
-    monkeypatch.setattr(backlog.decoding, "_keep", lambda images, _: sizes.append(len(images)))
+    keep = backlog._keep
+    monkeypatch.setattr(backlog.decoding, "_keep", lambda *kept: (sizes.append(len(kept[0])), keep(*kept)))
     backlog.add("vessel-1", *ids(4))
     backlog.run(lambda: backlog.waiting() == 0)
     assert sizes == [2, 2]
@@ -261,7 +244,7 @@ def worker(tmp_path):
 def coded(texture):
     stream = default_registry().create("emb").encode(texture(), 200)
     part = ImagePart(u="uuv-1", i="0001", n=1, t=1.7e9, p=stream)
-    return AcceptedImage("", "vessel-1", wire.encode(part)).coded_image()
+    return decoding.coded_image(BacklogRecord("key", wire.encode(part), "vessel-1"))
 
 
 @pytest.mark.system
@@ -281,7 +264,7 @@ def test_decoder_that_does_not_finish_is_ended_after_its_processor_time(worker, 
     # The kernel counts processor time in ticks: the decoding must last longer than one.
     stream = default_registry().create("emb").encode(texture(512, 512), 20_000)
     part = ImagePart(u="uuv-1", i="0001", n=1, t=1.7e9, p=stream)
-    coded = AcceptedImage("", "vessel-1", wire.encode(part)).coded_image()
+    coded = decoding.coded_image(BacklogRecord("key", wire.encode(part), "vessel-1"))
     before = signal.signal(signal.SIGPROF, signal.SIG_IGN)  # children inherit it
     try:
         result = worker(max_decode_s=1e-6).decode(coded)

@@ -43,7 +43,7 @@ def test_files_of_c2_are_readable_by_its_user_only(runner, platform, tmp_path, c
         eventually(lambda: relay.store.outbox_depth() == 0)
         names = assert_private(tmp_path / "deep")
         assert names >= {f"state/c2.db{suffix}" for suffix in ("", "-wal", "-shm", ".lock", ".watermark")}
-        assert names >= {"out/index.db", "out/index.db-wal", "out/vessel-1/decisions"}
+        assert names >= {"out/archive.db", "out/archive.db-wal", "out/vessel-1/decisions"}
         assert main(["c2", "ls", "--archive", str(out)]) == 0
         assert "1 images" in capsys.readouterr().out
     finally:

@@ -1,10 +1,8 @@
-"""Archive of files of c2: comparison with the index, retention, version of the index."""
+"""Archive of files of c2: restoration from the files, comparison with the digests, retention."""
 
 import logging
 import os
-import sqlite3
 import threading
-from contextlib import closing
 from dataclasses import replace
 
 import pytest
@@ -15,13 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost import keys
-from sonarpost.archive.image_files import write_image
+from sonarpost.archive.reader import open_archive
+from sonarpost.archive.rows import FILE_NAME, DecisionRow, ImageRow
 from sonarpost.archive.shore_files import find_image, image_paths, select_images
-from sonarpost.archive.shore_index import FILE_NAME, DecisionRow, ImageRow, ShoreIndex
 from sonarpost.cli.main import main
 from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import load_contacts
 from sonarpost.services.c2 import archive as c2_archive
+from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.service import C2Service
 
 DAY_S = 86400.0
 START_S = 1_700_000_000.0
@@ -39,7 +39,7 @@ def filled(open_files):
     return made
 
 
-def delete_index(out):
+def delete_archive(out):
     for path in out.glob(f"{FILE_NAME}*"):
         path.unlink()
 
@@ -58,7 +58,7 @@ def test_two_images_of_one_name_and_version_are_reported(open_files, out, caplog
     assert "one image of this name and version" in str(contacts.problems[0])
 
 
-def test_index_is_completed_from_the_files(open_files, out):
+def test_archive_is_restored_from_the_files(open_files, out):
     first = open_files()
     for each in (image(), image(value=2), image(version=2)):
         first.store_image(each, 5.0)
@@ -68,7 +68,7 @@ def test_index_is_completed_from_the_files(open_files, out):
     before = [replace(row, relayed_utc_s=None, accepted_utc_s=0.0) for row in first.index().images()]
     assert [row.conflict for row in before].count(True) == 1
     first.close()
-    delete_index(out)
+    delete_archive(out)
     (out / "vessel-1" / "broken.json").write_text("{")
     os.mkfifo(out / "vessel-1" / "pipe.json")
     (out / "vessel-1" / "zero.json").symlink_to("/dev/zero")
@@ -77,18 +77,10 @@ def test_index_is_completed_from_the_files(open_files, out):
     again = open_files().index()
     assert [replace(row, accepted_utc_s=0.0) for row in again.images()] == before
     assert [d.decision_id for d in again.decisions()] == ["d1"]
+    assert again.journal.position()[1] == 4
 
 
-def test_image_whose_files_were_stored_before_a_crash_is_indexed(open_files, out):
-    archive = open_files()
-    assert archive.index().images() == []
-    write_image(out / "vessel-1", image())
-    assert not archive.store_image(image(), 5.0).is_new
-    archive.flush()
-    assert len(archive.index().images()) == 1
-
-
-# Comparison of files and index
+# Comparison of files and digests
 
 
 def test_missing_and_changed_files_are_counted_logged_once_and_listed(filled, out, caplog, capsys):
@@ -109,7 +101,7 @@ def test_missing_and_changed_files_are_counted_logged_once_and_listed(filled, ou
     filled.verify(1e9, DAY_S)
     assert filled.defect_counts() == {"missing": 2, "changed": 3, "unreadable": 1, "conflicting": 0}
     filled.verify(1e9 + 2 * DAY_S, DAY_S)
-    assert [record.message for record in caplog.records] == ["Stored files differ from the index"]
+    assert [record.message for record in caplog.records] == ["Stored files differ from the archive"]
     assert main(["c2", "ls", "--archive", str(out)]) == 0
     text = capsys.readouterr().out
     assert [text.count(f"1 ({fault})") for fault in ("missing", "changed", "unreadable")] == [2, 2, 1]
@@ -117,7 +109,7 @@ def test_missing_and_changed_files_are_counted_logged_once_and_listed(filled, ou
     first.write_bytes(content)
     assert filled.store_image(image("0001"), 5.0).is_new
     filled.flush()
-    assert filled.defect_counts()["missing"] == 1
+    assert filled.index().defect_counts()["missing"] == 1
     filled.verify(1e9 + 4 * DAY_S, DAY_S)
     assert filled.defect_counts()["missing"] == 0
 
@@ -127,8 +119,8 @@ def test_service_compares_its_files_and_warns(begin, relay, out, monkeypatch):
     service = begin(verify_days=1e-6)
     relay.send(INBOX, "c2", *(relayed(image(value=n, start_s=START_S + 0.4 * n)) for n in (0, 1)))
     eventually(lambda: service.health().counters.get("images_conflicting") == 1)
+    eventually(lambda: service.health().detail == f"{out}: stored records 1 conflicting")
     assert service.health().state == "ok"
-    assert service.health().detail == f"{out}: stored records 1 conflicting"
     next(out.glob("*/*.png")).unlink()
     eventually(lambda: service.health().gauges["records_missing"] == 1)
     assert service.health().detail == f"{out}: stored records 1 missing, 1 conflicting"
@@ -138,7 +130,7 @@ def test_service_compares_its_files_and_warns(begin, relay, out, monkeypatch):
 
 
 def row(name, accepted_utc_s=0.0, size_bytes=100, exported_utc_s=None, **changes):
-    fields = dict.fromkeys(("relayed_utc_s", "lat_deg", "lon_deg", "atd_class", "atd_confidence"))
+    fields = dict.fromkeys(("relayed_utc_s",))
     fields |= dict.fromkeys(("first_frame_utc_s", "last_frame_utc_s", "missing_fraction"), 0.0)
     fields |= {"vessel_id": "vessel-1", "vehicle_id": "uuv-1", "image_id": "AAAA", "version": 1, "complete": True}
     fields |= {"height_px": 1, "width_px": 1, "codec": "vq", "accepted_utc_s": accepted_utc_s}
@@ -238,42 +230,27 @@ def test_service_removes_counts_and_logs(begin, relay, out, caplog):
     assert "Image removed by retention" in [record.message for record in caplog.records]
 
 
-# Index
+# Version
 
 
-@pytest.mark.parametrize("version", [4, 6])
-def test_index_of_another_version_is_rejected_and_unchanged(version, filled, out):
+def test_c2_does_not_start_with_an_archive_of_another_version(filled, platform, out):
+    with filled.index().database.transaction() as sql:
+        sql.exec_driver_sql("UPDATE archive SET version = 7")
     filled.close()
-    with closing(sqlite3.connect(out / FILE_NAME)) as db:
-        db.execute(f"PRAGMA user_version = {version}")
-    before = (out / FILE_NAME).read_bytes()
-    for writable in (True, False):
-        with pytest.raises(StoredFileError, match=rf"index\.db: user_version: got {version}, expected 5"):
-            ShoreIndex(out, writable=writable)
-    assert (out / FILE_NAME).read_bytes() == before
+    service = C2Service(platform("shore-1"), C2Config(out_dir=out))
+    with pytest.raises(StoredFileError, match=r"archive\.db: version: got 7, expected 1"):
+        service.start()
+    service._archive.close()
+    service.store.close()
 
 
-def test_records_wait_while_the_index_is_of_another_version(filled, begin, relay, out):
-    filled.close()
-    with closing(sqlite3.connect(out / FILE_NAME)) as db:
-        db.execute("PRAGMA user_version = 4")
-    service = begin()
-    relay.send(INBOX, "c2", relayed(image("000A")))
-    eventually(lambda: "user_version: got 4, expected 5" in service.health().detail, what="the reason in the health")
-    assert service.health().state == "degraded"
-    with closing(sqlite3.connect(out / FILE_NAME)) as db:
-        db.execute("PRAGMA user_version = 5")
-    eventually(lambda: service.health().counters.get("images_stored") == 1)
-    assert service.health().gauges["refused"] == 0
-
-
-def test_other_file_is_not_an_index(tmp_path):
-    with pytest.raises(StoredFileError, match="no such file"):
-        ShoreIndex(tmp_path, writable=False)
+def test_other_file_is_not_an_archive(tmp_path):
     (tmp_path / FILE_NAME).write_bytes(b"no database" * 100)
     for writable in (True, False):
-        with pytest.raises(StoredFileError, match=r"index\.db"):
-            ShoreIndex(tmp_path, writable=writable)
+        archive = open_archive(tmp_path, writable=writable)
+        with pytest.raises(StoredFileError, match=r"archive\.db"):
+            archive.database.prepare()
+        archive.close()
 
 
 def test_image_is_found_by_name_and_newest_version():

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import zenoh
 from builders.common import WAIT_S, eventually
+from builders.postgresql import execute
 from builders.records import decision_record, reconstructed_image
-from builders.shore import CONTACTS, relayed
+from builders.shore import CONTACTS, number_images, relayed
 from PIL import Image
 
 from sonarpost import keys, wire
@@ -20,7 +21,7 @@ from sonarpost.archive.journal import Journal
 from sonarpost.bus.catch_up import CatchUpSubscriber
 from sonarpost.messages import Comment, Contact, Decision, Pixels, ReconstructedImage
 from sonarpost.services.c2 import queries
-from sonarpost.services.c2.accepted import AcceptedRecords
+from sonarpost.services.c2.archive import Archive
 
 
 def image(image_id="0001", *, version=1, vehicle="uuv-1", vessel="vessel-1", lat=56.4, lon=-5.6, size=4, **changes):
@@ -182,8 +183,7 @@ def test_time_range_is_half_open(shore):
     shore.accept(image("0001"))
     [sample], _ = shore.replies(CONTACTS)
     at = msgpack.unpackb(sample.payload.to_bytes())["accepted"]["utc_s"]
-    with shore.service._accepted.journal()._using(writing=True) as db:
-        db.execute("UPDATE record SET accepted_utc_s = 1700000000.0")
+    execute(shore.service._archive.index(), "UPDATE record SET accepted_utc_s = 1700000000.0")
     assert at > 1700000000
     begin, later = "2023-11-14T22:13:20Z", "2023-11-14T22:13:21%2B00:00"
     assert shore.names(f"{CONTACTS}?_time=[{begin}..{later}[") == ["0001.1"]
@@ -281,14 +281,14 @@ def records(shore):
     return [wire.decode(types[msgpack.unpackb(payload)["type"]], payload, "k") for payload in payloads]
 
 
-def test_records_of_a_lost_journal_are_numbered_from_their_files(begin, runner, out):
+def test_records_of_a_lost_archive_are_numbered_from_their_files(begin, runner, out):
     shore = begin()
     sent = [image("0001"), partial_image("0002"), decision_record("d1")]
     shore.accept(*sent)
     before = records(shore)
     [old] = shore.replies(f"{CONTACTS}?limit=1")[0]
     runner.stop(shore.service)
-    for path in out.glob("journal.db*"):
+    for path in out.glob("archive.db*"):
         path.unlink()
     shore = begin()
     _, page = shore.replies(CONTACTS)
@@ -298,7 +298,7 @@ def test_records_of_a_lost_journal_are_numbered_from_their_files(begin, runner, 
     assert "the archive was replaced" in shore.error(f"{CONTACTS}?after={archive}.3")
 
 
-def test_missing_pixels_are_those_that_arrived_after_the_journal_is_made_again(begin, runner, out):
+def test_missing_pixels_are_those_that_arrived_after_the_archive_is_restored(begin, runner, out):
     shore = begin()
     partial = partial_image("0001")
     pixels = partial.pixels.to_array()
@@ -307,7 +307,7 @@ def test_missing_pixels_are_those_that_arrived_after_the_journal_is_made_again(b
     sent = partial.model_copy(update={"pixels": packed, "pixels_sha256": packed.sha256})
     shore.accept(sent)
     runner.stop(shore.service)
-    for path in out.glob("journal.db*"):
+    for path in out.glob("archive.db*"):
         path.unlink()
     shore = begin()
     [reply] = shore.replies(f"{CONTACTS}?limit=1")[0]
@@ -321,7 +321,8 @@ def test_removed_image_is_no_longer_sent(begin):
 
 
 def test_damaged_image_is_omitted_and_counted(shore, out):
-    shore.accept(image("0001"), image("0002"), image("0003"))
+    shore.accept(image("0001"), image("0002"))
+    shore.accept(image("0003"))  # from now on, the pixels of the others are in their files only
     first, second, _ = sorted((out / "vessel-1").glob("*.tiff"))
     shutil.copy(second, first)
     pixels = np.zeros((4, 4), np.uint8)
@@ -387,14 +388,14 @@ def test_queries_above_the_limits_are_refused_and_records_are_accepted(shore, mo
     """All threads of queries are occupied: further queries are refused, the records of vessels are not delayed."""
     shore.accept(image("0001"))
     blocked, released = threading.Semaphore(0), threading.Event()
-    fields = AcceptedRecords.fields
+    fields = Archive.fields
 
     def wait(self, row):
         blocked.release()
         released.wait(WAIT_S)
         return fields(self, row)
 
-    monkeypatch.setattr(AcceptedRecords, "fields", wait)
+    monkeypatch.setattr(Archive, "fields", wait)
     try:
         waiting = [shore.client.get(CONTACTS, timeout=WAIT_S) for _ in range(queries.MAX_IN_PROGRESS)]
         for _ in range(queries.THREADS):
@@ -431,15 +432,10 @@ def test_refused_rate_is_an_error_reply(shore, monkeypatch):
 # Catch up
 
 
-def accept_directly(service, images):
-    """Number images as c2 does, without image files and publication."""
-    service._accepted.number([service._accepted.image(each, "") for each in images])
-
-
 def test_subscriber_that_was_away_for_300_contacts_has_each_once(shore, reading):
     """Contacts arrive before, during and after the queries; some publications are repeated."""
     first = [image(f"{n:04X}") for n in range(1, 301)]
-    accept_directly(shore.service, first)
+    number_images(shore.service, first)
     reader = reading()
     eventually(lambda: len(reader.records) >= 100, what="first records")
     shore.accept(*(image(f"{n:04X}") for n in range(301, 321)), *first[:3])
@@ -448,7 +444,7 @@ def test_subscriber_that_was_away_for_300_contacts_has_each_once(shore, reading)
     got = reader.wait_for(321)
     assert sorted(got) == sorted([f"{n:04X}" for n in range(1, 321)] + ["FFFF"])
     assert len({r.seq for r in reader.records}) == 321
-    assert {r.archive for r in reader.records} == {shore.service._accepted.journal().archive}
+    assert {r.archive for r in reader.records} == {shore.service._archive.index().journal.position()[0]}
     # A later subscription continues at the cursor: again nothing twice.
     reader.close()
     shore.accept(image("FFFE"))
@@ -461,7 +457,7 @@ def test_subscriber_that_was_away_for_300_contacts_has_each_once(shore, reading)
 def test_lost_publications_are_fetched_by_the_next_query(shore, reading):
     reader = reading(refresh_s=0.2)
     eventually(lambda: reader.subscriber.is_caught_up)
-    accept_directly(shore.service, [image("0001"), image("0002")])  # not published
+    number_images(shore.service, [image("0001"), image("0002")])  # not published
     eventually(lambda: len(reader.records) == 2)
 
 
@@ -486,11 +482,11 @@ def test_subscriber_waits_for_c2_and_begins_anew_after_a_refused_cursor(begin, r
 
 
 def test_journal_that_cannot_be_written_degrades_c2_until_it_can(shore, monkeypatch):
-    def full(self, entries):
+    def full(self, sql, records):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Journal, "append_dated", full)
+        patch.setattr(Journal, "number", full)
         shore.put(keys.shore_inbox("vessel-1"), relayed(image("0001")))
         eventually(lambda: shore.service.health().state == "degraded")
     eventually(lambda: shore.names(CONTACTS) == ["0001.1"])

@@ -47,9 +47,9 @@ def send(relay, *records):
 
 
 def files(folder):
-    """All files but index and journal."""
+    """All files but the database."""
     found = (str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
-    return sorted(name for name in found if not name.startswith(("index.db", "journal.db")))
+    return sorted(name for name in found if not name.startswith("archive.db"))
 
 
 def test_image_is_stored_and_published_as_plain_msgpack(begin, relay, image, out, watch, check_monitoring):

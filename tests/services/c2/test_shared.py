@@ -9,20 +9,19 @@ import msgpack
 import pytest
 import zenoh
 from builders.common import WAIT_S, eventually, free_port
+from builders.postgresql import execute
 from builders.records import command_record, decision_record
 from builders.shore import CONTACTS, identity, image, relayed
 
 from sonarpost import keys, wire
 from sonarpost.archive.journal import Criteria
-from sonarpost.archive.shore_database import ShoreDatabase
+from sonarpost.archive.shore_archive import ShoreArchive
 from sonarpost.codec.registry import default_registry
 from sonarpost.delivery.client import deliver
 from sonarpost.errors import ConfigError, PayloadError
 from sonarpost.messages import Command, ImagePart
-from sonarpost.services.c2.accepted import AcceptedRecords
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
-from sonarpost.services.c2.shared_archive import SharedArchive
 
 VESSEL = "vessel-1"
 INBOX = keys.shore_inbox(VESSEL)
@@ -49,7 +48,7 @@ def begin(runner, platform, database_url, tmp_path):
 
 @pytest.fixture
 def archive(database):
-    return ShoreDatabase(database)
+    return ShoreArchive(database)
 
 
 @pytest.fixture
@@ -62,7 +61,7 @@ def deaf(begin, monkeypatch):
 
 @pytest.fixture
 def short_take_over(monkeypatch):
-    return lambda: monkeypatch.setattr("sonarpost.services.c2.shared_archive.TAKE_OVER_AFTER_S", 0.5)
+    return lambda: monkeypatch.setattr("sonarpost.services.c2.archive.TAKE_OVER_AFTER_S", 0.5)
 
 
 @pytest.fixture
@@ -88,7 +87,7 @@ def test_record_goes_to_one_of_two_c2_and_is_stored_once(begin, relay, archive, 
     assert counter("images_stored", *hosts) == 30
     assert counter("images_repeated", *hosts) == 0
     assert len(archive.images()) == 30
-    assert archive.accepted_count() == 0
+    assert archive.backlog.count() == 0
     assert not (tmp_path / "unused").exists()
 
 
@@ -119,7 +118,7 @@ def test_acknowledged_record_of_a_host_that_never_returns_is_handled_by_the_othe
     lose(deaf)
     second = begin("shore-2")
     eventually(lambda: len(archive.images()) == 5 and len(archive.decisions()) == 1)
-    eventually(lambda: archive.accepted_count() == 0)
+    eventually(lambda: archive.backlog.count() == 0)
     assert counter("records_taken_over", second) == 6
 
 
@@ -154,7 +153,7 @@ def test_nothing_is_acknowledged_while_the_database_is_down(begin, relay, archiv
     eventually(lambda: relay.store.outbox_depth() == 0)
     eventually(lambda: service.health().state == "ok")
     eventually(lambda: counter("records_handled", service) == 3)
-    assert archive.accepted_count() == 0
+    assert archive.backlog.count() == 0
 
 
 def test_invalid_record_is_quarantined_and_not_taken_over(begin, relay, archive, refused):
@@ -162,7 +161,7 @@ def test_invalid_record_is_quarantined_and_not_taken_over(begin, relay, archive,
     relay.send(INBOX, "c2", relayed(decision_record("d1")), relayed(decision_record("d1", verdict="not_mine_like")))
     eventually(lambda: len(refused(service)) == 1)
     assert "decision_id: got 'd1'" in refused(service)[0][1]
-    eventually(lambda: archive.accepted_count() == 0)
+    eventually(lambda: archive.backlog.count() == 0)
 
 
 def test_command_that_both_c2_have_accepted_is_sent_once(begin, client, runner, archive):
@@ -207,6 +206,7 @@ def test_database_of_another_site_ends_the_start(begin, platform, database_url):
     service = C2Service(platform("shore-9"), C2Config(database=database_url, site="north"))
     with pytest.raises(ConfigError, match="site: got 'north', expected shore"):
         service.start()
+    service._archive.close()
     service.store.close()
 
 
@@ -241,13 +241,13 @@ def test_coded_image_that_a_lost_host_has_not_decoded_is_decoded_by_the_other(
     relay.send(keys.shore_part(VESSEL), "c2", *parts)
     eventually(lambda: lost.health().gauges["images_undecoded"] == 4.0)
     eventually(lambda: relay.store.outbox_depth() == 0)
-    assert archive.accepted_count() == 4
+    assert archive.backlog.count() == 4
     lose(lost)
     second = begin("shore-2")
-    eventually(lambda: len(archive.images()) == 4 and archive.accepted_count() == 0)
+    eventually(lambda: len(archive.images()) == 4 and archive.backlog.count() == 0)
     eventually(lambda: counter("images_stored", second) == 4)
     # The coded images have the numbers that the lost host has given them.
-    journal = archive.journal()
+    journal = archive.journal
     rows = journal.page(journal.known_keys(), Criteria(), 0, 100)
     assert [row.fields["type"] for row in rows] == ["coded_image"] * 4 + ["reconstructed_image"] * 4
     assert [row.accepted.seq for row in rows] == list(range(1, 9))
@@ -257,8 +257,7 @@ def test_image_that_the_database_rejects_is_quarantined_alone(begin, relay, arch
     for name in ("RETRY_S", "MAX_RETRY_S"):
         monkeypatch.setattr(f"sonarpost.services.c2.decoding.{name}", 0.0)
     host = begin("shore-1", decode_workers=1)
-    with archive.database.transaction() as sql:
-        sql.rows("ALTER TABLE sonarpost.image ADD CONSTRAINT only_others CHECK (image_id <> '0001')")
+    execute(archive, "ALTER TABLE image ADD CONSTRAINT only_others CHECK (image_id <> '0001')")
     relay.send(keys.shore_part(VESSEL), "c2", *parts)
     eventually(lambda: len(archive.images()) == 3 and host.health().state == "degraded")
     for number in range(10, 20):
@@ -269,28 +268,11 @@ def test_image_that_the_database_rejects_is_quarantined_alone(begin, relay, arch
     [(key, reason)] = refused(host)
     assert key == keys.shore_part(VESSEL)
     assert "only_others" in reason
-    eventually(lambda: host.health().state == "ok" and archive.accepted_count() == 0)
-
-
-def test_stored_image_that_the_database_rejects_is_omitted_from_the_journal(archive, database_url, tmp_path):
-    config = C2Config(database=database_url, out_dir=tmp_path)
-    shared = SharedArchive(config, config.database_address(), "c2-a")
-    shared.open()
-    for record in numbered(1, 2, 3):
-        shared.store_image(record, 1e9)
-    shared.flush()
-    with archive.database.transaction() as sql:
-        sql.rows("ALTER TABLE sonarpost.record ADD CONSTRAINT only_others CHECK (image_id <> '0002')")
-    accepted = AcceptedRecords(shared, tmp_path, "shore")
-    journal = accepted.journal()
-    rows = journal.page(journal.known_keys(), Criteria(), 0, 100)
-    assert sorted(row.fields["image_id"] for row in rows) == ["0001", "0003"]
-    accepted.close()
-    shared.close()
+    eventually(lambda: host.health().state == "ok" and archive.backlog.count() == 0)
 
 
 def test_records_of_a_busy_c2_are_not_taken_over(begin, relay, archive, parts, monkeypatch):
-    monkeypatch.setattr("sonarpost.services.c2.shared_archive.TAKE_OVER_AFTER_S", 120.0)
+    monkeypatch.setattr("sonarpost.services.c2.archive.TAKE_OVER_AFTER_S", 120.0)
     with monkeypatch.context() as patch:
         patch.setattr("sonarpost.services.c2.decoding.Decoding.run", lambda _: None)
         busy = begin("shore-1")
@@ -298,18 +280,13 @@ def test_records_of_a_busy_c2_are_not_taken_over(begin, relay, archive, parts, m
     eventually(lambda: busy.health().gauges["images_undecoded"] == 4.0)
     second = begin("shore-2")
 
-    def members():
-        with archive.database.transaction() as sql:
-            return sql.number("SELECT count(*) FROM sonarpost.member")
-
-    eventually(lambda: members() == 2)
-    with archive.database.transaction() as sql:
-        # The records are old; their c2 is not.
-        sql.rows("UPDATE sonarpost.accepted SET accepted_at = accepted_at - interval '1 day'")
+    eventually(lambda: execute(archive, "SELECT count(*) FROM member")[0][0] == 2)
+    # The records are old; their c2 is not.
+    execute(archive, "UPDATE backlog SET accepted_utc_s = accepted_utc_s - 86400")
     taken = []
-    assert archive.take_over(30.0, 10, 1000, taken.extend) == 0
+    assert archive.backlog.take_over(30.0, 10, 1000, taken.extend) == 0
     assert counter("records_taken_over", second) == 0
-    assert archive.accepted_count() == 4
+    assert archive.backlog.count() == 4
 
 
 # Queries
@@ -364,7 +341,7 @@ def test_record_that_was_committed_and_not_published_is_available_from_the_other
     give(lost, image("0001"), decision_record("d1"))
     eventually(lambda: len(archive.images()) == 1)
     lose(lost)
-    assert archive.accepted_count() == 0
+    assert archive.backlog.count() == 0
     begin("shore-2")
     assert reading().wait_for(2) == ["0001", "d1"]
 
@@ -416,19 +393,6 @@ def test_query_goes_to_the_c2_that_reaches_the_database(begin, client):
         records, end = page(client)
         assert [record["image_id"] for record in records] == ["0001"]
         assert end["type"] == "page"
-
-
-def test_records_without_a_number_are_numbered_at_the_start(begin, runner, reading):
-    """`sonarpost c2 migrate` copies the records of a folder without a journal in this way."""
-    host = begin("shore-1")
-    host._archive.store_image(image("0001"), 5.0)
-    host._archive.store_decision(decision_record("d1"))
-    host._archive.flush()
-    runner.stop(host)
-    for _ in range(2):
-        host = begin("shore-1")
-        assert sorted(reading().wait_for(2)) == ["0001", "d1"]
-        runner.stop(host)
 
 
 def test_image_that_retention_of_another_c2_has_removed_is_no_longer_sent(begin, client):

@@ -1,14 +1,20 @@
-"""Contract of the archives of c2: files with an index in SQLite, and PostgreSQL."""
+"""Contract of the archive of c2, in files and in PostgreSQL."""
 
 import time
+from dataclasses import replace
 
 import pytest
-from builders.records import decision_record
+from builders.records import command_record, decision_record
 from builders.shore import image
 
-from sonarpost.archive.shore_index import TaskingRow
+from sonarpost import wire
+from sonarpost.archive.image_files import PREVIEW_NOTE, side_car_text
+from sonarpost.archive.journal import Criteria
 from sonarpost.errors import PayloadError
+from sonarpost.messages import Decision
+from sonarpost.services.c2.accepted import accepted_fields, accepted_payload, payload_of
 from sonarpost.services.c2.config import C2Config
+from sonarpost.services.c2.tasking import Tasking
 
 START_S = 1_700_000_000.0
 DAY_S = 86400.0
@@ -61,7 +67,10 @@ def test_different_record_of_the_same_name_is_a_conflict(archive, flush_between)
     archive.flush()
     rows = archive.index().images()
     assert [(row.first_frame_utc_s, row.conflict) for row in rows] == [(START_S, False), (START_S + 0.4, True)]
-    assert [archive.read_pixels(row.vessel_id, row.name)[0, 0] for row in rows] == [1, 2]
+    assert [archive.index().read_files(row.vessel_id, row.name)[".json"] for row in rows] == [
+        side_car_text(first),
+        side_car_text(second),
+    ]
     assert [row.verdict for row in archive.index().decisions()] == ["mine_like"]
     archive.apply_retention(START_S)
     assert archive.defect_counts()["conflicting"] == 1
@@ -129,10 +138,35 @@ def test_verification_compares_each_record_once_in_a_cycle_unless_disabled(open_
 
 
 def test_state_of_a_command_is_replaced(archive):
-    row = TaskingRow("vessel-1", "command", "c1", "uuv-1", None, "refine", "expert", 1.0, "waiting", "", 2.0)
-    delivered = TaskingRow("vessel-1", "command", "c1", "uuv-1", None, "refine", "expert", 1.0, "delivered", "", 3.0)
-    assert archive.claim_tasking(row, b"payload") is None
-    for each in (row, delivered):
-        archive.store_tasking([each])
-    assert archive.foreign_tasking("vessel-1", "command", "c1") is None
-    assert archive.index().tasking() == [delivered]
+    waiting = Tasking("vessel-1", "command", wire.encode(command_record("refine", "0001", command_id="c1")))
+    delivered = replace(waiting, state="delivered", changed_utc_s=3.0)
+    assert archive.index().claim_tasking(waiting.row(), waiting.payload) is None
+    for each in (waiting, delivered):
+        archive.store_state(each)
+    assert archive.index().tasking() == [delivered.row()]
+
+
+def test_preview_is_replaced_by_the_whole_and_does_not_replace_it(archive):
+    preview, whole = image(notes=(PREVIEW_NOTE,)), image(value=2)
+    archive.store_image(preview, 5.0)
+    [(_, first)] = archive.flush()
+    assert archive.store_image(whole, 5.0)[1:] == (True, False)
+    [(entry, second)] = archive.flush()
+    assert second.seq > first.seq, "its number is new, so that subscribers receive it"
+    assert archive.store_image(preview, 5.0)[1:] == (False, False)
+    archive.flush()
+    [row] = archive.index().images()
+    assert (row.name, row.conflict) == (entry.name, False)
+    journal = archive.index().journal
+    [found] = journal.page(journal.known_keys(), Criteria(), 0, 10)
+    assert archive.fields(found)["pixels"]["data"] == whole.pixels.data
+
+
+def test_publication_has_the_bytes_of_its_map(archive):
+    for record in (image(), decision_record("d1")):
+        if isinstance(record, Decision):
+            archive.store_decision(record)
+        else:
+            archive.store_image(record, 5.0)
+    for entry, accepted in archive.flush():
+        assert accepted_payload(entry, accepted) == payload_of(accepted_fields(wire.map_of(entry.record), accepted))

@@ -2,15 +2,12 @@
 
 import msgpack
 import pytest
-import zenoh
-from builders.common import eventually, free_port
+from builders.common import eventually
 
-from research.common.link_emulator import LinkEmulator
 from sonarpost import keys, wire
-from sonarpost.archive.shore_index import ShoreIndex
-from sonarpost.bus.session import router_config
+from sonarpost.archive.reader import open_reader
 from sonarpost.errors import StoredFileError
-from sonarpost.messages import Command, Comment, TaskingState
+from sonarpost.messages import Command, Comment
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
@@ -63,88 +60,12 @@ def command(command_id="c1", kind="refine"):
 
 
 def states(out):
-    """Delivery states by vessel, kind and identifier; empty while there is no index."""
+    """Delivery states by vessel, kind and identifier; empty while there is no archive."""
     try:
-        index = ShoreIndex(out, writable=False)
+        with open_reader(out) as archive:
+            return {(row.vessel_id, row.kind, row.record_id): row.state for row in archive.tasking()}
     except StoredFileError:
         return {}
-    try:
-        return {(row.vessel_id, row.kind, row.record_id): row.state for row in index.tasking()}
-    finally:
-        index.close()
-
-
-def test_comment_and_command_reach_their_consumers_on_the_vessel(begin, relay, expert, console, op_modem, out, watch):
-    shown, aboard = watch(keys.tasking_state("vessel-1")), watch("sonarpost/v1/vessel-1/**")
-    service = begin()
-    relay()
-    screen, modem = console(), op_modem()
-    expert.send(COMMENT, "c2", comment())
-    expert.send(COMMAND, "c2", command())
-    eventually(lambda: screen.received == [comment()] and modem.received == [command()])
-    eventually(lambda: set(states(out).values()) == {"delivered"})
-    assert set(states(out)) == {("vessel-1", "comment", "a1"), ("vessel-1", "command", "c1")}
-    eventually(lambda: len(shown) >= 2)
-    told = [msgpack.unpackb(sample.payload.to_bytes()) for sample in shown]
-    assert {(t["type"], t["state"]) for t in told} <= {(TaskingState.TYPE, s) for s in ("waiting", "delivered")}
-    # On the vessel, only the relay publishes them.
-    eventually(lambda: len([s for s in aboard if "/health/" not in str(s.key_expr)]) == 2)
-    assert service.health().counters["tasking_accepted"] == 2
-
-
-def test_comment_waits_for_an_unreachable_vessel(begin, relay, expert, console, out, runner):
-    service = begin()
-    expert.send(COMMENT, "c2", comment("a1"), comment("a2"))
-    eventually(lambda: service.gauges()["waiting_for_vessels"] == 2)
-    eventually(lambda: list(states(out).values()) == ["waiting"] * 2)
-    runner.stop(service)
-    service = begin()
-    assert service.gauges()["waiting_for_vessels"] == 2
-    screen = console()
-    relay(commands=())
-    eventually(lambda: [a.comment_id for a in screen.received] == ["a1", "a2"])
-    eventually(lambda: list(states(out).values()) == ["delivered"] * 2)
-    assert service.gauges()["waiting_for_vessels"] == 0
-
-
-def test_comment_arrives_once_after_a_link_cut(begin, runner, platform, expert, out, tmp_path, router):
-    """Two routers, linked through a connection that can be cut."""
-    link = LinkEmulator(int(router.rpartition(":")[2]))
-    vessel_endpoint = f"tcp/127.0.0.1:{free_port()}"
-    vessel_router = zenoh.open(router_config([vessel_endpoint], [f"tcp/127.0.0.1:{link.port}"]))
-    aboard = platform("vessel-1").model_copy(update={"router": (vessel_endpoint,)})
-    screen_type = type("Console", (type(expert),), {"NAME": "console"})
-    try:
-        service = begin()
-        runner.start(RelayService(aboard, RelayConfig(comment_consumers=("console",))))
-        screen = runner.start(screen_type(aboard, {keys.comment("vessel-1"): Comment}))
-        expert.send(COMMENT, "c2", comment("before"))
-        eventually(lambda: [a.comment_id for a in screen.received] == ["before"])
-        eventually(lambda: states(out).get(("vessel-1", "comment", "before")) == "delivered")
-        link.cut()
-        expert.send(COMMENT, "c2", comment("later"))
-        eventually(lambda: states(out).get(("vessel-1", "comment", "later")) == "waiting")
-        eventually(lambda: not service.is_responding("relay@vessel-1"))
-        assert [a.comment_id for a in screen.received] == ["before"]
-        link.mend()
-        eventually(lambda: [a.comment_id for a in screen.received] == ["before", "later"])
-        eventually(lambda: states(out).get(("vessel-1", "comment", "later")) == "delivered")
-    finally:
-        runner.stop_all()
-        vessel_router.close()
-        link.close()
-
-
-def test_unreachable_vessel_does_not_delay_others(begin, relay, expert, console, out):
-    begin()
-    relay()
-    screen = console()
-    expert.send(keys.tasking_comment("vessel-9"), "c2", comment("far", vessel="vessel-9"))
-    eventually(lambda: states(out) == {("vessel-9", "comment", "far"): "waiting"})
-    expert.send(COMMENT, "c2", comment("near"))
-    eventually(lambda: [a.comment_id for a in screen.received] == ["near"])
-    eventually(lambda: states(out)["vessel-1", "comment", "near"] == "delivered")
-    assert states(out)["vessel-9", "comment", "far"] == "waiting"
 
 
 def test_record_without_a_consumer_is_refused_with_a_state_at_the_shore(begin, relay, expert, out, refused):
@@ -155,9 +76,8 @@ def test_record_without_a_consumer_is_refused_with_a_state_at_the_shore(begin, r
     eventually(lambda: list(states(out).values()) == ["refused"] * 2)
     reasons = [reason for _, reason in refused(service)]
     assert any("a name in [relay] comment_consumers" in reason for reason in reasons)
-    index = ShoreIndex(out, writable=False)
-    assert all("no consumer on vessel-1" in row.reason for row in index.tasking())
-    index.close()
+    with open_reader(out) as archive:
+        assert all("no consumer on vessel-1" in row.reason for row in archive.tasking())
 
 
 def test_repeated_comment_is_accepted_once_and_a_conflicting_one_refused(begin, relay, expert, console, refused):
@@ -212,14 +132,14 @@ def test_tasking_state_that_cannot_be_read_or_published_delays_no_other(runner, 
         tx.put_state("archive-owner", b"\xff")
     runner.stop(service)
     service = begin()
-    store_tasking = service._archive.store_tasking
+    store_state = service._archive.store_state
 
-    def store_or_fail(rows):
-        if rows[0].record_id == "c1":
+    def store_or_fail(item):
+        if item.record_id == "c1":
             raise RuntimeError("a defect")
-        store_tasking(rows)
+        return store_state(item)
 
-    service._archive.store_tasking = store_or_fail
+    service._archive.store_state = store_or_fail
     expert.send(COMMAND, "c2", command("c1"), command("c2"))
     relay()
     op_modem()
@@ -227,5 +147,5 @@ def test_tasking_state_that_cannot_be_read_or_published_delays_no_other(runner, 
     eventually(lambda: "tasking: RuntimeError: a defect" in service.health().detail)
     assert len(service._owner()) == 32
     assert service.health().counters["states_discarded"] == 3
-    service._archive.store_tasking = store_tasking
+    service._archive.store_state = store_state
     eventually(lambda: states(out).get(("vessel-1", "command", "c1")) == "delivered")

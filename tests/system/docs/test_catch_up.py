@@ -10,6 +10,7 @@ from builders.common import REPOSITORY, WAIT_S, eventually
 from builders.exports import image
 from builders.line_program import run_program
 from builders.record_samples import SAMPLES
+from builders.shore import number_images
 
 from sonarpost import keys, wire
 from sonarpost.archive.journal import Accepted
@@ -72,8 +73,7 @@ def test_selectors_are_valid_and_zenoh_parses_them(c2, client):
 
 
 def test_program_of_the_how_to(c2, router, tmp_path, run_program, monkeypatch):
-    accept = c2._accepted
-    accept.number([accept.image(image(f"{n:04X}"), "") for n in range(1, 4)])
+    number_images(c2, [image(f"{n:04X}") for n in range(1, 4)])
     monkeypatch.chdir(tmp_path)
     (tmp_path / "catch_up.py").write_text(block(HOW_TO, "catch_up"), encoding="utf-8")
     program = run_program(sys.executable, "catch_up.py", router)

@@ -17,6 +17,7 @@ from builders.common import REPOSITORY, eventually
 from builders.exports import decision, image
 from builders.line_program import run_program
 from builders.rest_interface import rest_interface
+from builders.shore import number_images
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config
@@ -72,7 +73,7 @@ def rust_program():
 
 def check(c2, start):
     """Check a program: 300 records missed, then new ones, a repeated one, then a restart with a cursor."""
-    c2._accepted.number([c2._accepted.image(image(f"{n:04X}"), "") for n in range(1, 301)])
+    number_images(c2, [image(f"{n:04X}") for n in range(1, 301)])
     program = start("")
     lines = program.read(300)
     assert lines == [f"{n} reconstructed_image uuv-1 {n:04X} 1 -" for n in range(1, 301)]
@@ -80,7 +81,7 @@ def check(c2, start):
     assert program.read(2) == ["301 reconstructed_image uuv-1 0AAA 1 -", "302 decision uuv-1 0AAA - mine_like"]
     program.stop()
     assert program.lines.empty()
-    archive = c2._accepted.journal().archive
+    archive = c2._archive.index().journal.position()[0]
     accept(c2, image("0BBB"))
     again = start(f"{archive}.301")
     assert again.read(2) == ["302 decision uuv-1 0AAA - mine_like", "303 reconstructed_image uuv-1 0BBB 1 -"]
@@ -93,7 +94,7 @@ def check_pair(pair, start):
     """Check a program with two c2: 300 records missed, half of each c2, then one of them ends."""
     for first in range(1, 301, 10):
         service = pair[first // 10 % 2]
-        service._accepted.number([service._accepted.image(image(f"{n:04X}"), "") for n in range(first, first + 10)])
+        number_images(service, [image(f"{n:04X}") for n in range(first, first + 10)])
     lines = [f"{n} reconstructed_image uuv-1 {n:04X} 1 -" for n in range(1, 301)]
     program = start("")
     assert program.read(300) == lines

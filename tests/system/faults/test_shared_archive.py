@@ -21,8 +21,8 @@ from builders.progress import wait_while_progressing
 from builders.records import decision_record, reconstructed_image
 
 from sonarpost import keys, wire
-from sonarpost.archive.postgresql import ConnectionPool, DatabaseAddress
-from sonarpost.archive.shore_database import ShoreDatabase
+from sonarpost.archive.address import DatabaseAddress
+from sonarpost.archive.reader import open_archive
 from sonarpost.bus.catch_up import CatchUpSubscriber
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.codec.registry import default_registry
@@ -74,7 +74,7 @@ class SharedShore:
         self.server = server
         self.url = server.new_database()
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
-        self.archive = ShoreDatabase(ConnectionPool(DatabaseAddress.parse(self.url)), writable=False)
+        self.archive = open_archive(DatabaseAddress.parse(self.url), writable=False)
         self._processes = {}
         self.kills = Counter()
 
@@ -198,7 +198,7 @@ class Traffic:
         archive = self.shore.archive
         try:
             images = {(row.vessel_id, row.vehicle_id, row.image_id) for row in archive.images()}
-            return images, {row.decision_id for row in archive.decisions()}, archive.accepted_count()
+            return images, {row.decision_id for row in archive.decisions()}, archive.backlog.count()
         except DatabaseUnavailableError:
             return None
 

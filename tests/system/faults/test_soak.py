@@ -183,7 +183,7 @@ def test_services_neither_grow_nor_lose_a_contact_over_a_long_mission(tmp_path):
             folders[f"store of {service}"] = [store, store.with_name(f"{store.name}-wal")]
         folders["images of the vessel"] = [settings.vessel_images]
         folders["images of the shore site"] = [settings.shore_images]
-        folders["index of the shore site"] = [settings.shore_images.parent / "index.db"]
+        folders["archive of the shore site"] = [settings.shore_images.parent / "archive.db"]
         folders["logs"] = [settings.folder / "logs"]
         samples = Samples(chain, folders)
         mission = Mission(settings, history)

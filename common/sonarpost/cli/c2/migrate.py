@@ -15,13 +15,12 @@ from hashlib import sha256
 from pathlib import Path
 from typing import TypeVar
 
+from sonarpost.archive.address import DatabaseAddress
 from sonarpost.archive.image_files import SUFFIXES, other_name
-from sonarpost.archive.journal import FILE_NAME, Journal
-from sonarpost.archive.postgresql import ConnectionPool, DatabaseAddress
-from sonarpost.archive.reader import COMMAND_TIMEOUT_S, read_image_files
-from sonarpost.archive.shore_database import ShoreDatabase, StoredImage
-from sonarpost.archive.shore_files import decision_path, index_missing_files
-from sonarpost.archive.shore_index import DecisionRow, ImageRow, ShoreIndex
+from sonarpost.archive.reader import COMMAND_TIMEOUT_S, open_archive, open_reader
+from sonarpost.archive.rows import ImageRow
+from sonarpost.archive.shore_archive import Batch, ShoreArchive, StoredImage
+from sonarpost.archive.shore_files import decision_name
 from sonarpost.cli.c2.stored import EXIT_INCOMPLETE, SHORE_CONFIG
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
@@ -61,15 +60,12 @@ def run(parsed: argparse.Namespace) -> int:
         raise ConfigError(str(parsed.config), "c2.database", "nothing", "the address of a PostgreSQL database")
     folder: Path = parsed.archive or config.out_dir
     with (
-        closing(ShoreIndex(folder)) as index,
-        closing(ShoreDatabase(ConnectionPool(address, COMMAND_TIMEOUT_S), site=config.site)) as database,
+        open_reader(folder) as source,
+        closing(open_archive(address, site=config.site, timeout_s=COMMAND_TIMEOUT_S)) as database,
     ):
-        index_missing_files(folder, index)
-        migration = Migration(folder, index, database)
+        database.database.prepare()
+        migration = Migration(source, database)
         migration.run()
-        if (folder / FILE_NAME).is_file():
-            with closing(Journal(folder)) as journal:
-                migration.counts["numbered"] = database.adopt_journal(journal)
     counts = migration.counts
     print(
         f"{folder} to {address}: images {counts['images']} copied, {counts['images present']} present; decisions"
@@ -81,111 +77,108 @@ def run(parsed: argparse.Namespace) -> int:
 
 
 class Migration:
-    """Copy of a folder of c2 into a database.
+    """Copy of an archive into another one.
 
     Attributes:
         counts: Numbers of copied, present and compared records, and of those added to the journal.
         problems: Records that are damaged, or of which the database has another content.
     """
 
-    def __init__(self, folder: Path, index: ShoreIndex, database: ShoreDatabase) -> None:
+    def __init__(self, source: ShoreArchive, database: ShoreArchive) -> None:
         self.counts: Counter[str] = Counter()
         self.problems: list[str] = []
-        self._folder = folder
-        self._index = index
+        self._source = source
         self._database = database
 
     def run(self) -> None:
         """Copy and compare all records."""
-        rows = self._index.images(removed=True)
+        rows = self._source.images(removed=True)
         with ProgressDisplay(step="copying images") as display:
             for number, batch in enumerate(_batches(rows)):
                 display.show("copying images", number * BATCH, len(rows))
                 self._copy_images(batch)
         self._copy_decisions()
-        tasking = self._index.tasking()
+        tasking = self._source.tasking()
         for part in _batches(tasking):
-            self._database.put_tasking(part)
+            self._database.write(Batch(tasking=[*part]))
         self.counts["tasking"] = len(tasking)
+        self.counts["numbered"] = self._database.adopt_numbers(self._source)
 
     def _copy_images(self, rows: Sequence[ImageRow]) -> None:
         new: dict[tuple[str, str], StoredImage] = {}
-        expected: dict[tuple[str, str], dict[str, str]] = {}
+        expected: dict[tuple[str, str], StoredImage] = {}
         for image in self._stored_images(rows):
             placed, is_present = self._place(image)
-            key = (placed.row.vessel_id, placed.row.name)
+            own = (placed.row.vessel_id, placed.row.name)
             self.counts["images present" if is_present else "images"] += 1
             if not is_present:
-                new[key] = placed
-            if not is_present or self._database.find_side_car(*key) == (_digest(placed), True):
-                expected[key] = {suffix: sha256(data).hexdigest() for suffix, data in placed.files}
+                new[own] = placed
+            if not is_present or self._database.find_image(*own) == (placed.row.side_car_sha256, True):
+                expected[own] = placed
         if new:
-            self._database.write([*new.values()])
-        found = self._database.file_digests([replace(rows[0], vessel_id=v, name=n) for v, n in expected])
-        for key, digests in expected.items():
+            self._database.write(Batch(images=[*new.values()]))
+        for (vessel_id, name), image in expected.items():
             self.counts["compared"] += 1
-            if digests != found.get(key, {}):
-                self.problems.append(f"{'/'.join(key)}: the files in the database differ")
+            if image.files and self._database.file_digests(vessel_id, name) != _digests(image.row.files_sha256):
+                self.problems.append(f"{vessel_id}/{name}: the files in the database differ")
 
     def _stored_images(self, rows: Sequence[ImageRow]) -> Iterator[StoredImage]:
-        """Yield the images whose files are as the index states; removed ones without files."""
+        """Yield the images whose files have the stored digests; removed ones without files."""
         for row in rows:
             if row.removed_utc_s is not None:
                 yield StoredImage(row, ())
                 continue
             try:
-                files = read_image_files(self._folder, row)
+                files = self._source.read_files(row.vessel_id, row.name)
             except StoredFileError as error:
                 self.problems.append(str(error))
                 continue
-            contents = tuple((suffix, files[f"{row.name}{suffix}"]) for suffix in SUFFIXES)
-            digests = " ".join(sha256(data).hexdigest() for _, data in contents)
-            if digests != row.files_sha256:
-                self.problems.append(f"{row.vessel_id}/{row.name}: the files differ from the index")
+            contents = tuple((suffix, files[suffix]) for suffix in SUFFIXES)
+            if " ".join(sha256(data).hexdigest() for _, data in contents) != row.files_sha256:
+                self.problems.append(f"{row.vessel_id}/{row.name}: the files differ from their digests")
                 continue
             yield StoredImage(replace(row, verified_utc_s=None, fault=""), contents)
 
     def _place(self, image: StoredImage) -> tuple[StoredImage, bool]:
         """Return an image with the name that it has in the database, and whether it is there."""
         row = image.row
-        found = self._database.find_side_car(row.vessel_id, row.name)
-        if found is not None and found[0] != _digest(image) and image.files:
+        found = self._database.find_image(row.vessel_id, row.name)
+        if found is not None and found[0] != row.side_car_sha256 and image.files:
             row = replace(row, name=other_name(row.name, image.files[0][1]), conflict=True)
-            found = self._database.find_side_car(row.vessel_id, row.name)
+            found = self._database.find_image(row.vessel_id, row.name)
         # An image that retention has removed from the database is not restored.
         return StoredImage(row, image.files), found is not None
 
     def _copy_decisions(self) -> None:
-        new: list[tuple[DecisionRow, bytes]] = []
-        for row in self._index.decisions():
-            path = decision_path(self._folder, row.vessel_id, row.decision_id)
+        new = []
+        for row in self._source.decisions():
+            where, name = f"{row.vessel_id}/{row.decision_id}", decision_name(row.decision_id)
             try:
-                content = path.read_bytes()
-            except OSError as error:
-                self.problems.append(f"{path}: {error.strerror or error}")
+                content = self._source.read_files(row.vessel_id, name, SUFFIXES[:1])[SUFFIXES[0]]
+            except StoredFileError as error:
+                self.problems.append(str(error))
                 continue
-            digest = sha256(content).hexdigest()
-            if digest != row.files_sha256:
-                self.problems.append(f"{path}: the file differs from the index")
+            if sha256(content).hexdigest() != row.files_sha256:
+                self.problems.append(f"{where}: the file differs from its digest")
                 continue
             found = self._database.find_decision(row.vessel_id, row.decision_id)
             if found is None:
                 new.append((replace(row, verified_utc_s=None, fault=""), content))
-            elif found != digest:
-                self.problems.append(f"{path}: the database has another decision with this identifier")
+            elif found != row.files_sha256:
+                self.problems.append(f"{where}: the database has another decision with this identifier")
             else:
                 self.counts["decisions present"] += 1
         for part in _batches(new):
-            self._database.write([], part)
-        for row, content in new:
+            self._database.write(Batch(decisions=[*part]))
+        for row, _ in new:
             self.counts["compared"] += 1
-            if self._database.decision_content(row) != content:
+            if self._database.file_digests(row.vessel_id, decision_name(row.decision_id)) != {row.files_sha256}:
                 self.problems.append(f"{row.vessel_id}/{row.decision_id}: the decision in the database differs")
         self.counts["decisions"] = len(new)
 
 
-def _digest(image: StoredImage) -> str:
-    return image.row.files_sha256.partition(" ")[0]
+def _digests(text: str) -> set[str]:
+    return set(text.split())
 
 
 def _batches(items: Sequence[T]) -> Iterator[Sequence[T]]:

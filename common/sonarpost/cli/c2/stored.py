@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -21,8 +21,8 @@ from rich.table import Table
 from rich.text import Text
 
 from sonarpost.archive.reader import ArchivePlace, as_folder, open_reader, place_of, read_image_files
+from sonarpost.archive.rows import DecisionRow, ImageRow, TaskingRow, document_of
 from sonarpost.archive.shore_files import find_image
-from sonarpost.archive.shore_index import DecisionRow, ImageRow, TaskingRow
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import flag, in_new_folder, make_output_folder, option, print_rejected, printable, time_text
@@ -32,6 +32,7 @@ from sonarpost.export.contacts import ContactSet, ExportContact, load_contacts, 
 from sonarpost.export.formats import exporters, write_export
 from sonarpost.export.text import probabilities_text
 from sonarpost.files import write_atomically
+from sonarpost.messages import Contact
 from sonarpost.services.c2.config import C2Config
 
 DEMO_IMAGES = Path("demo-out/shore/images")
@@ -183,8 +184,8 @@ def run_ls(parsed: argparse.Namespace) -> int:
     rows = select_images(images, record_filter, undecided=parsed.undecided, all_versions=parsed.all_versions)
     if parsed.json:
         for row in rows:
-            decision = None if row.decision is None else asdict(row.decision)
-            print(json.dumps({**asdict(row.image), "decision": decision}))
+            decision = None if row.decision is None else document_of(row.decision)
+            print(json.dumps({**document_of(row.image), "decision": decision}))
     else:
         _print_images(rows)
     return 0
@@ -240,9 +241,10 @@ def _print_images(rows: Sequence[ListedImage]) -> None:
     cells = []
     for row in rows:
         image, decision = row.image, row.decision
-        located = image.lat_deg is not None and image.lon_deg is not None
-        confidence = "" if image.atd_confidence is None else f"{image.atd_confidence:.2f}"
-        named = " ".join(part for part in (image.atd_class or "", confidence) if part)
+        contact = image.contact or Contact(contact_id="none", vehicle_id=image.vehicle_id)
+        located = contact.lat_deg is not None and contact.lon_deg is not None
+        confidence = "" if contact.atd_confidence is None else f"{contact.atd_confidence:.2f}"
+        named = " ".join(part for part in (contact.atd_class or "", confidence) if part)
         cells.append(
             (
                 image.vessel_id,
@@ -250,9 +252,9 @@ def _print_images(rows: Sequence[ListedImage]) -> None:
                 _version_text(image),
                 time_text(image.first_frame_utc_s),
                 f"{100 * image.missing_fraction:.0f} %",
-                f"{image.lat_deg:.5f} {image.lon_deg:.5f}" if located else "",
+                f"{contact.lat_deg:.5f} {contact.lon_deg:.5f}" if located else "",
                 ", ".join(
-                    part for part in (named, probabilities_text(image.p_mine_like, image.p_other_object)) if part
+                    part for part in (named, probabilities_text(contact.p_mine_like, contact.p_other_object)) if part
                 ),
                 "" if decision is None else " ".join(p for p in (decision.verdict, decision.mlo_class or "") if p),
                 "" if decision is None else decision.operator,
@@ -270,7 +272,7 @@ def _print_tasking(rows: Iterable[TaskingRow], record_filter: RecordFilter, *, a
     chosen = [row for row in rows if record_filter.accepts(row.vessel_id, row.vehicle_id, row.issued_utc_s)]
     if as_json:
         for row in chosen:
-            print(json.dumps(asdict(row)))
+            print(json.dumps(document_of(row)))
         return
     headings = ("vessel", "kind", "id", "image", "text", "by", "issued (UTC)", "state", "reason")
     cells = []
