@@ -46,10 +46,9 @@ SHIPPED = "a file of this package"
 READS = {
     "common/sonarpost/archive/codebook_transfer.py": "written by this function, in pieces up to the limit",
     "common/sonarpost/archive/image_files.py": "side-car of the archive",
-    "common/sonarpost/archive/postgresql.py": OWN_SETTINGS,
+    "common/sonarpost/archive/address.py": OWN_SETTINGS,
     "common/sonarpost/runtime/serial_device.py": "/proc of the kernel",
     "common/sonarpost/bus/router.py": OWN_SETTINGS,
-    "common/sonarpost/cli/c2/migrate.py": "decision of the archive",
     "common/sonarpost/cli/deployment/config_files.py": SHIPPED,
     "common/sonarpost/cli/deployment/install_units.py": SHIPPED,
     "common/sonarpost/cli/detection/options.py": OWN_SETTINGS,
@@ -67,7 +66,6 @@ READS = {
     "common/sonarpost/security/fleet.py": OWN_SETTINGS,
     "common/sonarpost/security/tls_files.py": OWN_SETTINGS,
     "common/sonarpost/sonar/options.py": "its size is compared with 64 KiB first",
-    "services/c2/archive.py": "decision of the archive",
     "common/sonarpost/cli/console.py": "keyboard",
     "services/console/web/server.py": SHIPPED,
 }
@@ -118,7 +116,6 @@ def packages(*names):
 CALLERS = ("services/", *packages("archive", "cli", "delivery", "extensions", "monitoring", "runtime"))
 MAPPED = "its caller `main` reports it"
 RAISES = {
-    "common/sonarpost/cli/c2/migrate.py: Migration._stored_images: read_image_files": "a folder, not a database",
     "common/sonarpost/cli/pki.py: run_acoustic: create_key": MAPPED,
     "common/sonarpost/cli/pki.py: run_router_config: write_new": MAPPED,
     "services/atd_stub/service.py: AtdStubService._process: _content_of": "its caller tries the file again",

@@ -21,7 +21,7 @@ class C2Config(RetentionConfig):
 
     Attributes:
         site: Name of this site in keys; relays name it in their upstreams.
-        out_dir: Folder of the stored records, with a folder for each vessel and an index.
+        out_dir: Folder of the stored records, with a folder for each vessel and a database.
         max_bytes: Maximum size of the stored images; above it the vessel with the most bytes loses images: exported
             ones first, then those without a decision, then the others, each the oldest first. Decisions are never
             removed. Each of the three files of an image counts at least 16 KiB.
@@ -32,7 +32,7 @@ class C2Config(RetentionConfig):
             without one they are in `out_dir`. The connection uses TLS, unless the server is on this host or the address
             ends in `?sslmode=disable`; `sslrootcert=FILE` names the authority.
         database_password_file: File with the password, in place of one in the address.
-        verify_days: Time in which every stored file is compared with the index once; 0 disables the comparison.
+        verify_days: Time in which every stored file is compared with its digest once; 0 disables the comparison.
         json_mirror: Whether c2 also publishes every record as JSON below `{site}/json`, for clients without msgpack.
     """
 

@@ -14,7 +14,7 @@ from typing import Any, Final, TypeVar
 
 import sqlalchemy as sa
 
-from sonarpost.archive.database import Database
+from sonarpost.archive.database import ShoreDatabase
 from sonarpost.archive.schema import BACKLOG, MEMBER
 
 CHUNK: Final = 500
@@ -59,7 +59,7 @@ class Backlog:
         owner: Identity of this c2 among those that share it.
     """
 
-    def __init__(self, database: Database, owner: str) -> None:
+    def __init__(self, database: ShoreDatabase, owner: str) -> None:
         self._database = database
         self._owner = owner
         insert = database.insert(BACKLOG)

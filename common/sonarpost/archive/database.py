@@ -28,7 +28,7 @@ _STEPS: Final = 10_000
 """Instructions of SQLite between two checks of that time."""
 
 
-class Database(ABC):
+class ShoreDatabase(ABC):
     """Transactions for several threads. The tables are created, or their version is compared, in the first one.
 
     Args:
@@ -54,7 +54,7 @@ class Database(ABC):
         self._site = site
         self._is_prepared = False
         self._prepare_lock = threading.RLock()
-        sa.event.listen(engine, "handle_error", self._on_error)
+        sa.event.listens_for(engine, "handle_error")(self._on_error)
 
     def prepare(self) -> None:
         """Create the tables, or check their version.
@@ -163,12 +163,12 @@ class Database(ABC):
         """Return the error for a database that cannot be used at present."""
 
 
-class SqliteDatabase(Database):
+class SqliteDatabase(ShoreDatabase):
     """The file `archive.db` in one folder.
 
     Args:
         out_dir: The folder.
-        site: See `Database`.
+        site: See `ShoreDatabase`.
         writable: Whether to create the file; otherwise it is opened read-only.
 
     Raises:

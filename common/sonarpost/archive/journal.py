@@ -19,7 +19,7 @@ import sqlalchemy as sa
 from sqlalchemy.sql import ColumnElement
 
 from sonarpost import wire
-from sonarpost.archive.database import Database
+from sonarpost.archive.database import ShoreDatabase
 from sonarpost.archive.schema import ARCHIVE, RECORD, REVIEW
 from sonarpost.limits import limit
 from sonarpost.messages import Contact, Decision, Record
@@ -169,7 +169,7 @@ class Journal:
     Every method raises OSError or DatabaseUnavailableError if the database cannot be used.
     """
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: ShoreDatabase) -> None:
         self._database = database
         key = (REVIEW.c.vessel_id, REVIEW.c.vehicle_id, REVIEW.c.image_id)
         insert = database.insert(REVIEW)

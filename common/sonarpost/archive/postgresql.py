@@ -20,7 +20,7 @@ from sqlalchemy.dialects import postgresql
 from typing_extensions import override
 
 from sonarpost.archive.address import DatabaseAddress
-from sonarpost.archive.database import Database
+from sonarpost.archive.database import ShoreDatabase
 from sonarpost.archive.schema import SCHEMA
 from sonarpost.errors import ConfigError, DatabaseUnavailableError, RejectedByDatabaseError
 
@@ -43,7 +43,7 @@ _TABLES_LOCK = 0x736F6E61725F01
 _CANCELED = "57014"
 
 
-class PostgresDatabase(Database):
+class PostgresDatabase(ShoreDatabase):
     """A database with PostGIS, which several c2 share.
 
     A connection that fails is closed, and with it all idle ones. While the server is not reached, a transaction fails
@@ -52,8 +52,8 @@ class PostgresDatabase(Database):
     Args:
         address: Address of the database.
         timeout_s: Time limit to connect and to wait for an answer.
-        site: See `Database`.
-        writable: See `Database`.
+        site: See `ShoreDatabase`.
+        writable: See `ShoreDatabase`.
     """
 
     is_shared = True

@@ -138,7 +138,7 @@ _index(RECORD, "accepted_utc_s")
 def _only_postgresql(table: sa.Table, statement: str) -> None:
     """Run a statement after the table was created in PostgreSQL."""
     ddl: Any = sa.DDL
-    sa.event.listen(table, "after_create", ddl(statement).execute_if(dialect="postgresql"))
+    sa.event.listens_for(table, "after_create")(ddl(statement).execute_if(dialect="postgresql"))
 
 
 _POSITION = "ST_SetSRID(ST_MakePoint(lon_deg, lat_deg), 4326)"

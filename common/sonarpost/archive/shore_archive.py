@@ -20,7 +20,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from sonarpost.archive.backlog import CHUNK, Backlog, BacklogRecord, chunks
-from sonarpost.archive.database import Database
+from sonarpost.archive.database import ShoreDatabase
 from sonarpost.archive.image_files import SUFFIXES
 from sonarpost.archive.journal import Accepted, Journal
 from sonarpost.archive.rows import DEFECTS, DecisionRow, Fault, ImageRow, MarkColumn, Row, TaskingRow, Verified
@@ -91,7 +91,7 @@ class ShoreArchive:
         backlog: Records that are accepted and not stored yet.
     """
 
-    def __init__(self, database: Database, folder: Path | None = None, owner: str = "") -> None:
+    def __init__(self, database: ShoreDatabase, folder: Path | None = None, owner: str = "") -> None:
         self.database = database
         self.folder = folder
         self.journal = Journal(database)
