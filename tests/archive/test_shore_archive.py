@@ -152,6 +152,26 @@ def test_row_number_and_end_of_the_acceptance_are_one_transaction(archive):
     assert (len(archive.images()), archive.backlog.count(), archive.journal.position()[1]) == (1, 0, 2)
 
 
+def test_coded_images_wait_in_the_order_of_their_acceptance(open_):
+    first, other = open_("c2-a"), open_("c2-b")
+    parts = [BacklogRecord("key", b"part %d" % number, "vessel-1") for number in range(40)]
+    if first.database.is_shared:
+        first.backlog.accept([replace(part, vessel_id="") for part in parts])
+        assert first.backlog.waiting_vessels() == other.backlog.waiting_vessels() == []
+    first.write(Batch(waiting=parts[:20]))
+    first.write(Batch(waiting=parts[20:]))
+    assert (first.backlog.waiting_vessels(), first.backlog.waiting_count()) == (["vessel-1"], 40)
+    found = first.backlog.waiting("vessel-1", 0, 30)
+    assert [record.payload for record in found] == [part.payload for part in parts[:30]]
+    rest = first.backlog.waiting("vessel-1", found[-1].id, 30)
+    assert [record.payload for record in rest] == [part.payload for part in parts[30:]]
+    first.write(Batch(finished=rest))
+    assert first.backlog.waiting_record(rest[0].id) is None
+    first.write(Batch(waiting=parts[30:]))
+    again = first.backlog.waiting("vessel-1", rest[-1].id, 30)
+    assert len(again) == 10, "a number is never used again"
+
+
 # Verification
 
 

@@ -134,7 +134,7 @@ class Backlog:
             }
             for record in records
         }
-        return [values[key] for key in sorted(values)]
+        return list(values.values())  # in the order of acceptance
 
     def delete(self, sql: sa.Connection, records: Sequence[BacklogRecord]) -> None:
         """Delete records in an open transaction."""
