@@ -62,17 +62,12 @@ class Backlog:
     def __init__(self, database: ShoreDatabase, owner: str) -> None:
         self._database = database
         self._owner = owner
-        insert = database.insert(BACKLOG)
-        self._accept = insert.on_conflict_do_nothing()
-        self._put_waiting = insert.on_conflict_do_update(
-            index_elements=(BACKLOG.c.sha256, BACKLOG.c.key),
-            set_={n: insert.excluded[n] for n in ("is_coded", "vessel_id")},
-        )
+        self._insert = database.insert(BACKLOG)
 
     def accept(self, records: Sequence[BacklogRecord]) -> None:
         """Commit records that are acknowledged afterwards."""
         with self._database.transaction() as sql:
-            self._database.put(sql, self._accept, self._values(sql, records))
+            self._database.put(sql, self._insert.on_conflict_do_nothing(), self._values(sql, records))
 
     def discard(self, records: Sequence[BacklogRecord]) -> None:
         """Delete accepted records that cannot be stored."""
@@ -80,8 +75,13 @@ class Backlog:
             self.delete(sql, records)
 
     def add_waiting(self, sql: sa.Connection, records: Sequence[BacklogRecord]) -> None:
-        """Add coded images in an open transaction."""
-        self._database.put(sql, self._put_waiting, self._values(sql, records))
+        """Add coded images in an open transaction.
+
+        They get numbers above those of all images that the decoder has tried, also if this c2 or another one has
+        accepted them before.
+        """
+        self.delete(sql, records)
+        self._database.put(sql, self._insert, self._values(sql, records))
 
     def count(self) -> int:
         """Return the number of records of all c2."""
