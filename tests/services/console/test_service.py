@@ -319,7 +319,7 @@ def test_missed_records_give_the_same_state_as_live_ones(runner, start, platform
     send(records[1:])
     eventually(lambda: is_stored(live, 4), what="live records")
     runner.stop(c2)  # it makes its records from the files again
-    for path in (tmp_path / "out").glob("journal.db*"):
+    for path in (tmp_path / "out").glob("archive.db*"):
         path.unlink()
     runner.start(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out")))
     console = start(role="shore")
