@@ -351,16 +351,16 @@ class ConsoleService(Service[ConsoleConfig]):
         key = keys.shore_contact_all(self.config.site)
         cursor = self.store.states(_CURSOR).get("", b"").decode()
         while not self.stopping.is_set():
-            with CatchUpSubscriber(self.session, key, cursor) as records:
-                try:
+            try:
+                with CatchUpSubscriber(self.session, key, cursor) as records:
                     while not self.stopping.is_set():
                         self._store_batch(self._next_batch(records))
                         if records.cursor != cursor:
                             cursor = records.cursor
                             with self.store.transaction() as tx:
                                 tx.put_state(_CURSOR, cursor.encode())
-                except (DeliveryError, QueryRefusedError) as error:
-                    self._not_stored_log.log(reason=str(error)[:300])
+            except (DeliveryError, QueryRefusedError, zenoh.ZError) as error:
+                self._not_stored_log.log(reason=str(error)[:300])
             self.stopping.wait(UPDATE_INTERVAL_S)
 
     def _next_batch(self, records: CatchUpSubscriber) -> list[ReconstructedImage | Decision]:

@@ -29,6 +29,7 @@ from builders.records import decision_record
 from builders.shore import Site, relayed
 
 from sonarpost import keys, wire
+from sonarpost.bus.catch_up import CatchUpSubscriber
 from sonarpost.bus.session import client_config, router_config
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.messages import (
@@ -336,6 +337,22 @@ def test_record_of_another_vessel_than_its_key_is_ignored(start, client):
     eventually(lambda: console.health().counters.get("records_ignored") == 1, what="ignored record")
     site.accept(decision_record(image_id="00A7"), image_record("00A7"))
     eventually(lambda: console.state.counts().total == 1, what="image")
+
+
+def test_failed_query_does_not_stop_the_shore_console(start, client, monkeypatch):
+    poll = CatchUpSubscriber.poll
+    errors = [zenoh.ZError("not sent")]
+
+    def fail_once(self, timeout_s):
+        if errors:
+            raise errors.pop()
+        return poll(self, timeout_s)
+
+    monkeypatch.setattr(CatchUpSubscriber, "poll", fail_once)
+    Site(client, image())
+    console = start(role="shore")
+    eventually(lambda: console.stopping.is_set() or console.state.counts().total == 1, what="image")
+    assert console.state.counts().total == 1
 
 
 def test_decision_is_sent_after_a_restart(start_with_image, runner, start, log_in):
