@@ -67,6 +67,7 @@ class CompressorService(Service[CompressorConfig]):
             config.codec, replace(resources, strength=0.0)
         )
         super().__init__(platform, config)
+        self._is_compiled = False
         self._cache = EncodeCache(self.store, config.cache_images)
         log.info("Codec ready", extra=kv(codec=self._codec.name, model=self._codec.model_hash[:16]))
 
@@ -78,8 +79,12 @@ class CompressorService(Service[CompressorConfig]):
 
     @override
     def is_quick(self, record: Record) -> bool:
-        """Return whether a record is a small snippet."""
-        return isinstance(record, Snippet) and record.pixels.height_px * record.pixels.width_px <= QUICK_PIXELS
+        """Return whether a record is a small snippet, and not the first one, which may compile the codec."""
+        return (
+            self._is_compiled
+            and isinstance(record, Snippet)
+            and record.pixels.height_px * record.pixels.width_px <= QUICK_PIXELS
+        )
 
     @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
@@ -89,6 +94,7 @@ class CompressorService(Service[CompressorConfig]):
             return
         assert isinstance(record, Snippet)
         image_id, cached = self._encode(record, effects, effects.payload, self._codec)
+        self._is_compiled = True
         if self.config.cache_images:
             self._cache.put(effects, {image_id: cached})
 

@@ -55,6 +55,7 @@ class DecompressorService(Service[DecompressorConfig]):
         # Before the store is opened, so that a configuration error leaves no open store.
         self._decoder = Decoder(config.codebooks)
         super().__init__(platform, config)
+        self._is_compiled = False
         self._retention = Retention(self._apply_retention, self.stopping)
         self._copy_origin, self._copies = uuid.uuid4().bytes, 0
         self._publisher: zenoh.Publisher | None = None
@@ -100,9 +101,9 @@ class DecompressorService(Service[DecompressorConfig]):
 
     @override
     def is_quick(self, record: Record) -> bool:
-        """Return whether an image is small."""
+        """Return whether an image is small, and not the first one, which may compile the codec."""
         assert isinstance(record, ReceivedImage)
-        return (record.height_px or 0) * (record.width_px or 0) <= QUICK_PIXELS
+        return self._is_compiled and (record.height_px or 0) * (record.width_px or 0) <= QUICK_PIXELS
 
     @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
@@ -110,6 +111,7 @@ class DecompressorService(Service[DecompressorConfig]):
         assert isinstance(record, ReceivedImage)
         try:
             image = self._decoder.decode(record)
+            self._is_compiled = True
         except BadInputError as error:
             log.error("Image cannot be decoded", extra=kv(reason=str(error)))
             self._quarantine_stream(record, str(error), effects)

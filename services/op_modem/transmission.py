@@ -167,8 +167,8 @@ class Ranging:
 class VesselTransmitter:
     """Sends commands and feedback to the vehicles, polls and pings them, when the channel is free.
 
-    The state that follows from a packet is committed when the modem has sent it: a restart repeats at most one packet,
-    with other counters, and the vehicle recognises a repeated command by its token.
+    The state that follows from a packet is committed before it is sent, so that nothing is transmitted again and again
+    while the disk is full, and once more when the modem has sent it.
 
     Attributes:
         error: Why no packet can be sent; empty if the last one could.
@@ -235,9 +235,10 @@ class VesselTransmitter:
             return
         if self._ranging.in_progress and self._ranging.due_address(time.monotonic()) is None:
             return
-        now_s, now = time.monotonic(), time.time()
-        receiving = self._modem.receiving or self._is_packet_arriving
         with self._link.step() as link:
+            # Read with the lock held: a frame that arrived while it was waited for makes the channel busy.
+            now_s, now = time.monotonic(), time.time()
+            receiving = self._modem.receiving or self._is_packet_arriving
             pending = link.endpoint.due_address(now) is not None
             if self._gate.may_transmit(now_s, now, receiving=receiving, pending=pending):
                 self._send(link, now)
@@ -249,6 +250,7 @@ class VesselTransmitter:
         reserve_counters(self._service.store, link.authenticator)
         packet = link.endpoint.next_packet(rate.frames, rate.frame_bytes, now)
         if packet is not None:
+            self._service.commit(UnitOfWork())
             packet_id = self._modem.send_packet(packet.address, rate.number, packet.frames)
             self._in_flight = (packet_id, packet)
 

@@ -182,6 +182,19 @@ def test_command_is_repeated_until_it_is_confirmed(modem_pair, begin, console, s
     assert states("c-1")[-1].times_sent >= 3
 
 
+def test_nothing_is_sent_while_the_disk_rejects_the_state(modem_pair, begin, console, states, vehicle, unwritable):
+    service = begin()  # no modem yet
+    console.send(keys.command(VESSEL, "refine"), "op_modem", command())
+    eventually(lambda: service.health().gauges["commands_open"] == 1.0)
+    with unwritable(service):
+        modem_pair.start()
+        far = vehicle()
+        eventually(lambda: "DeliveryError" in service.degraded_reason())
+        assert not far.commands
+        assert states("c-1")[-1].state == "asked"
+    eventually(lambda: states("c-1")[-1].state == "confirmed")
+
+
 def test_command_survives_a_restart_and_the_same_record_is_added_once(
     modem_pair, begin, runner, console, states, vehicle
 ):

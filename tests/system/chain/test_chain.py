@@ -163,7 +163,10 @@ def test_lost_frames_are_shown_as_missing_exactly_where_the_channel_lost_them(st
 
 
 def test_vessel_with_another_codebook_reports_it_and_writes_no_image(start_chain):
-    run = start_chain(rate=4, codebook="nominal-20", vessel_codebooks=("nominal-10",))
+    run = start_chain(
+        rate=4,
+        extra=(("compressor", 'codebook = "nominal-20"'), ("decompressor", 'codebooks = ["nominal-10"]')),
+    )
     run.deposit(2)
     run.until(lambda: run.watcher.health["decompressor"].gauges["refused"] == 2, "both images refused")
     run.until_idle()

@@ -239,7 +239,6 @@ def _service_tables(settings: ChainSettings) -> dict[str, dict[str, object]]:
         "op_modem": vessel,
         "decompressor": {
             "out_dir": settings.vessel_images,
-            "codebooks": ["nominal-10", "nominal-20"],
             **({"image_consumers": ["relay", "console"]} if has_page else {}),
         },
         "relay": {"comment_consumers": ["console"]} if has_page else {},
