@@ -14,8 +14,9 @@ from sonarpost.export.live import LiveContacts
 from sonarpost.review.rendering import encode_png
 
 
-def test_stream_has_the_stored_contacts_and_those_missed_in_an_interruption(monkeypatch):
+def test_stream_has_the_stored_contacts_and_those_missed_in_an_interruption(monkeypatch, capsys):
     monkeypatch.setattr("sonarpost.bus.catch_up.RETRY_S", 0.1)
+    monkeypatch.setattr("sonarpost.cli.c2.watch.DISCONNECTED_AFTER_S", -1.0)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     hub = zenoh.open(router_config([endpoint]))
     records = [image("0001"), image("0002", vessel_id="vessel-2")]
@@ -37,10 +38,13 @@ def test_stream_has_the_stored_contacts_and_those_missed_in_an_interruption(monk
         assert (changes[2].contact.review, changes[2].png) == ("mine_like", None)
         hub.close()
         eventually(lambda: poll() == ["0001"] * 3 and not session.info.routers_zid())
+        poll(), poll()
+        assert "router not reached" in capsys.readouterr().err
         stream._records._refresh_s = 0.2
         hub = zenoh.open(router_config([endpoint]))
         Site(hub, *records, image("0003"))  # accepted while this program was not connected
         eventually(lambda: poll() == ["0001"] * 3 + ["0003"])
+        assert "router reconnected" in capsys.readouterr().err
     finally:
         session.close()
         hub.close()

@@ -11,6 +11,7 @@ from builders.exports import FIRST_UTC_S, decision, image, mission, store
 from sonarpost import keys, wire
 from sonarpost.errors import StoredFileError
 from sonarpost.export.contacts import load_contacts
+from sonarpost.export.live import LiveContacts
 from sonarpost.messages import Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
@@ -23,6 +24,14 @@ def test_latest_image_version_is_exported(tmp_path):
     assert contact.image.version == 10  # compared as a number, not as text
     assert contact.image_path.name.endswith("_v10.png")
     assert found.problems == ()
+
+
+def test_masks_are_not_kept_in_memory(tmp_path):
+    partial = image(missing_mask=b"\x80" * 48, complete=False, missing_fraction=0.125)
+    (stored,) = load_contacts(store(tmp_path, partial)).contacts
+    assert (stored.image.missing_fraction, stored.image.missing_mask) == (0.125, "")
+    live = LiveContacts().add(partial)
+    assert (live.image.missing_fraction, live.image.missing_mask) == (0.125, "")
 
 
 def test_latest_decision_is_exported_for_any_image_version(tmp_path):

@@ -109,7 +109,7 @@ class ExportContact:
     """One contact to export.
 
     Attributes:
-        image: Side-car of the latest version of its image.
+        image: Side-car of the latest version of its image, without `missing_mask`, which no export uses.
         decisions: All decisions about it, oldest first.
         image_path: PNG of that version; None if the file is missing or only the contact record was received.
         size: Size as operators measured it; empty at the shore site, which receives no measurements.
@@ -195,7 +195,7 @@ class StoredRecords:
     """Files of the c2 service's folder.
 
     Attributes:
-        images: Side-car and path of every stored image version.
+        images: Side-car, without `missing_mask`, and path of every stored image version.
         decisions: All stored decisions.
         problems: One error for each rejected file.
     """
@@ -260,7 +260,7 @@ def read_stored_records(out_dir: Path) -> StoredRecords:
         for path in _json_files(folder, problems):
             image = _read(ImageSideCar, path, problems)
             if image is not None and _is_of_vessel(image, folder, path, problems):
-                images.append((image, path))
+                images.append((image.model_copy(update={"missing_mask": ""}), path))
         for path in _json_files(folder / DECISIONS, problems):
             decision = _read(Decision, path, problems)
             if decision is not None and _is_of_vessel(decision, folder, path, problems):

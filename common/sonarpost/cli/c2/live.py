@@ -10,7 +10,7 @@ import zenoh
 
 from sonarpost import keys
 from sonarpost.bus.catch_up import CatchUpSubscriber
-from sonarpost.cli.c2.watch import POLL_S, decoded
+from sonarpost.cli.c2.watch import POLL_S, ConnectionLog, decoded
 from sonarpost.cli.shared import add_router_options, add_site_option, flag, option
 from sonarpost.export.contacts import ExportContact
 from sonarpost.export.live import LiveContacts
@@ -48,6 +48,7 @@ class ContactStream:
     """
 
     def __init__(self, session: zenoh.Session, site: str, vessel: str | None, *, stored: bool) -> None:
+        self._connection = ConnectionLog(session)
         self._records = CatchUpSubscriber(session, keys.shore_contact_all(site), only_new=not stored)
         self._vessel = vessel
         self._contacts = LiveContacts()
@@ -58,6 +59,7 @@ class ContactStream:
         Raises:
             QueryRefusedError: c2 refuses the query.
         """
+        self._connection.check()
         found = self._records.poll(POLL_S)
         record = None if found is None else decoded(found, self._vessel)
         if isinstance(record, (ReconstructedImage, Decision)):

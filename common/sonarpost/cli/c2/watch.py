@@ -64,7 +64,7 @@ def run(parsed: argparse.Namespace) -> int:
 
 
 class RecordSubscription:
-    """Records that a site accepts from now on. Zenoh reconnects; this class logs it.
+    """Records that a site accepts from now on.
 
     Args:
         session: Session at the router of the site.
@@ -73,18 +73,16 @@ class RecordSubscription:
     """
 
     def __init__(self, session: zenoh.Session, site: str, vessel: str | None) -> None:
-        self._session = session
+        self._connection = ConnectionLog(session)
         self._vessel = vessel
         self._turns = [
             CatchUpSubscriber(session, key, only_new=True)
             for key in (keys.shore_contact_all(site), keys.tasking_state_all(site))
         ]
-        self._disconnected_since_s: float | None = None
-        self._disconnect_logged = False
 
     def poll(self) -> ReconstructedImage | Decision | TaskingState | None:
         """Return the next record; None if there is none for 0.2 s, or if it is invalid or of another vessel."""
-        self._check_connection()
+        self._connection.check()
         for timeout_s in (0.0, POLL_S / 2):
             for _ in self._turns:
                 self._turns.reverse()
@@ -93,8 +91,21 @@ class RecordSubscription:
                     return decoded(found, self._vessel)
         return None
 
-    def _check_connection(self) -> None:
-        """Log when the connection to the router is lost and when it is restored."""
+
+class ConnectionLog:
+    """Prints when a session loses its router and when it has reconnected, which Zenoh does.
+
+    Args:
+        session: The session.
+    """
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._disconnected_since_s: float | None = None
+        self._disconnect_logged = False
+
+    def check(self) -> None:
+        """Print a change since the last call."""
         if self._session.info.routers_zid():
             if self._disconnect_logged:
                 _log("router reconnected")
