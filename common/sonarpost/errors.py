@@ -114,7 +114,7 @@ class DatabaseUnavailableError(DeliveryError):
 
 
 class RejectedByDatabaseError(DatabaseUnavailableError):
-    """The database server rejects a value of a statement."""
+    """The database server, or an SQLite file, rejects a value of a statement."""
 
 
 _ERRNO_OF_RECORD = frozenset({errno.ENAMETOOLONG, errno.EINVAL, errno.EILSEQ, errno.EISDIR, errno.ENOTDIR, errno.ELOOP})

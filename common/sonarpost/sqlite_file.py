@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sonarpost.errors import DeliveryError
+from sonarpost.errors import DeliveryError, RejectedByDatabaseError
 from sonarpost.files import make_private
 
 BUSY_TIMEOUT_S = 10.0
@@ -60,10 +60,13 @@ class SqliteFile:
 
         Raises:
             DeliveryError: The file cannot be read.
+            RejectedByDatabaseError: A value of a statement violates a constraint or is too large.
         """
         with self._lock:
             try:
                 yield self._db
+            except (sqlite3.DataError, sqlite3.IntegrityError) as error:
+                raise RejectedByDatabaseError(f"{self.path}: {error}") from error
             except sqlite3.Error as error:
                 raise DeliveryError(f"{self.path}: {error}") from error
 

@@ -15,7 +15,7 @@ from sonarpost.bus.catch_up import CatchUpSubscriber
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
-from sonarpost.errors import BadInputError, DeliveryError, PayloadError, QueryRefusedError
+from sonarpost.errors import BadInputError, DeliveryError, PayloadError, QueryRefusedError, can_concern_record
 from sonarpost.logs import IntervalLog, kv
 from sonarpost.messages import (
     AcousticFrame,
@@ -97,7 +97,7 @@ class ConsoleService(Service[ConsoleConfig]):
         self.state = ConsoleState(config, self._database, modem=modem_driver(platform.modem.driver).capabilities)
         self._app = ConsoleApp(self.state, self._users, platform.id)
         self._server: WebServer | None = None
-        self._send_error = self._fleet_error = ""
+        self._send_error = self._follow_error = self._fleet_error = ""
         self._fleet_log = IntervalLog(log, logging.ERROR, "Fleet state not published")
         self._ignored_log = IntervalLog(log, logging.WARNING, "Invalid record ignored")
         self._not_stored_log = IntervalLog(log, logging.ERROR, "Record not stored")
@@ -119,7 +119,6 @@ class ConsoleService(Service[ConsoleConfig]):
     def _on_vessel(self) -> bool:
         return self.config.role == "vessel"
 
-    @override
     @override
     def consumed_keys(self) -> Mapping[str, type[Record]]:
         if not self._on_vessel:
@@ -354,13 +353,18 @@ class ConsoleService(Service[ConsoleConfig]):
             try:
                 with CatchUpSubscriber(self.session, key, cursor) as records:
                     while not self.stopping.is_set():
-                        self._store_batch(self._next_batch(records))
+                        self._disk_reserve.require()
+                        batch = self._next_batch(records)
+                        self._store_batch(batch)
                         if records.cursor != cursor:
                             cursor = records.cursor
                             with self.store.transaction() as tx:
                                 tx.put_state(_CURSOR, cursor.encode())
-            except (DeliveryError, QueryRefusedError, zenoh.ZError) as error:
-                self._not_stored_log.log(reason=str(error)[:300])
+                        if batch or records.is_caught_up:
+                            self._follow_error = ""
+            except (OSError, MemoryError, DeliveryError, QueryRefusedError, zenoh.ZError) as error:
+                self._follow_error = f"{type(error).__name__}: {error}"
+                self._not_stored_log.log(reason=self._follow_error[:300])
             self.stopping.wait(UPDATE_INTERVAL_S)
 
     def _next_batch(self, records: CatchUpSubscriber) -> list[ReconstructedImage | Decision]:
@@ -384,21 +388,20 @@ class ConsoleService(Service[ConsoleConfig]):
         return batch
 
     def _store_batch(self, batch: Sequence[ReconstructedImage | Decision]) -> None:
-        """Store records in halves down to one that fails, which is left out.
+        """Store records in halves down to one that fails, which is quarantined.
 
         Raises:
-            DeliveryError: The database cannot be written.
+            OSError, MemoryError, DeliveryError: A failure that concerns no single record, for example a full disk.
         """
         images = [record for record in batch if isinstance(record, ReconstructedImage)]
         try:
             new = self.state.store_images(images)
             stored = [self.state.store_decision(record) for record in batch if isinstance(record, Decision)]
-        except DeliveryError:
-            raise
-        except Exception as error:  # noqa: BLE001  concerns one of the records
+        except Exception as error:
+            if not can_concern_record(error):
+                raise
             if len(batch) == 1:
-                self.count("records_ignored")
-                self._ignored_log.log(error, key=batch[0].TYPE, reason=str(error)[:300])
+                self._quarantine(batch[0], error)
                 return
             half = len(batch) // 2
             self._store_batch(batch[:half])
@@ -411,6 +414,14 @@ class ConsoleService(Service[ConsoleConfig]):
                 ("decisions_repeated", len(stored) - sum(stored)),
             ):
                 self.count(name, number)
+
+    def _quarantine(self, record: ReconstructedImage | Decision, error: Exception) -> None:
+        reason = f"{type(error).__name__}: {error}"
+        with self.store.transaction() as tx:
+            # No key of the inbox: a console at a shore site has none.
+            tx.quarantine("in", f"c2 {record.TYPE}/{record.vessel_id}", wire.encode(record), reason, is_accepted=True)
+        self.count("records_failed")
+        log.error("Record quarantined: it cannot be stored", exc_info=error, extra=kv(vessel=record.vessel_id))
 
     # Stop and health
 
@@ -433,7 +444,7 @@ class ConsoleService(Service[ConsoleConfig]):
         """Return why records are not queued, received or shown, or old images not removed; empty if they are."""
         router = self.state.router
         no_router = "" if router is None or router.reached else f"router {router.detail} not reached"
-        return self._send_error or no_router or self._fleet_error or self._retention.error
+        return self._send_error or self._follow_error or no_router or self._fleet_error or self._retention.error
 
     @override
     def warning(self) -> str:

@@ -42,8 +42,7 @@ class LiveContacts:
 
         Returns:
             The contact without `image_path` and `missing_mask`; None for a repeated record, an older version, or a
-            decision about an image
-            that has not arrived.
+            decision about an image that has not arrived.
         """
         if isinstance(record, Decision):
             return self._add_decision(record)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import threading
 import time
 from types import SimpleNamespace
@@ -31,7 +32,7 @@ from builders.shore import Site, relayed
 from sonarpost import keys, wire
 from sonarpost.bus.catch_up import CatchUpSubscriber
 from sonarpost.bus.session import client_config, router_config
-from sonarpost.errors import ConfigError, PortError
+from sonarpost.errors import ConfigError, DeliveryError, PortError
 from sonarpost.messages import (
     Command,
     Comment,
@@ -47,6 +48,7 @@ from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.service import ConsoleService
+from sonarpost.services.console.store import contacts
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService
 
@@ -161,20 +163,54 @@ def test_invalid_subscribed_and_stored_records_affect_no_other(start, client, mo
     assert console.health().state == "degraded"
 
 
-def test_a_record_that_fails_ends_no_batch(start, monkeypatch):
+@pytest.mark.parametrize("error", [OverflowError("too large"), sqlite3.IntegrityError("NOT NULL constraint failed")])
+def test_a_record_that_fails_ends_no_batch(start, monkeypatch, error):
     console = start(role="shore")
-    store_images = console.state.store_images
+    store_image = contacts.store_image
 
-    def fail(images):
-        if any(one.image_id == "0003" for one in images):
-            raise OverflowError("too large")
-        return store_images(images)
+    def fail(db, image, *options):
+        if image.image_id == "0003":
+            raise error
+        return store_image(db, image, *options)
 
-    monkeypatch.setattr(console.state, "store_images", fail)
+    monkeypatch.setattr(contacts, "store_image", fail)
     records = [image_record(f"{number:04}") for number in range(7)]
     console._store_batch(records)
-    assert console.health().counters["images_taken"] == 6
+    counters = console.health().counters
+    assert (counters["images_taken"], counters["records_failed"]) == (6, 1)
     assert console.state.counts().total == 6
+    [kept] = console.store.quarantined()
+    assert (kept.size_bytes, kept.can_be_queued) == (len(wire.encode(records[3])), False)
+    assert str(error) in kept.reason
+
+
+@pytest.mark.parametrize("error", [MemoryError("none"), OSError(28, "No space left on device"), DeliveryError("full")])
+def test_records_of_c2_are_stored_after_a_failure_has_passed(start, client, monkeypatch, error):
+    monkeypatch.setattr("sonarpost.services.console.service.UPDATE_INTERVAL_S", 0.1)
+    Site(client, *(image_record(f"{number:04}") for number in range(3)))
+    with monkeypatch.context() as patched:
+
+        def fail(*_):
+            raise error
+
+        patched.setattr(contacts, "store_image", fail)
+        console = start(role="shore")
+        eventually(lambda: str(error) in console.health().detail, what="degraded")
+        assert console.store.states("cursor") == {}
+    eventually(lambda: console.state.counts().total == 3, what="images")
+    eventually(lambda: console.health().state == "ok", what="recovery")
+
+
+def test_records_of_c2_are_not_stored_below_the_disk_reserve(start, client, monkeypatch):
+    monkeypatch.setattr("sonarpost.services.console.service.UPDATE_INTERVAL_S", 0.1)
+    monkeypatch.setattr("sonarpost.runtime.service.HANDLING_RESERVE_BYTES", 1 << 62)
+    Site(client, image())
+    console = start(role="shore")
+    eventually(lambda: "below the reserve" in console.health().detail, what="degraded")
+    assert console.state.counts().total == 0
+    console._disk_reserve._reserve_bytes = 0
+    eventually(lambda: console.state.counts().total == 1, what="image")
+    eventually(lambda: console.health().state == "ok", what="recovery")
 
 
 def test_fleet_state_that_fails_degrades_health_until_it_is_published_again(start, monkeypatch):
