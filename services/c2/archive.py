@@ -83,7 +83,7 @@ class Archive:
         self._batch = Batch()
         self._entries: list[JournalEntry] = []
         self._defects = dict.fromkeys(DEFECTS, 0)
-        self._images_bytes = self._waiting = 0
+        self._images_bytes = 0
         self._take_over_records = TAKE_OVER_RECORDS
 
     def open(self) -> None:
@@ -235,7 +235,6 @@ class Archive:
     def discard(self, record: BacklogRecord) -> None:
         """Delete an accepted record that cannot be stored."""
         self.shore.backlog.discard([record])
-        self._waiting -= bool(record.vessel_id)
 
     def flush(self) -> list[tuple[JournalEntry, Accepted]]:
         """Commit the records since the last call, with their numbers, and return these.
@@ -252,7 +251,6 @@ class Archive:
         entries, self._entries = self._entries, []
         batch.numbered = [columns(entry) for entry in entries]
         numbers = self.shore.write(batch) if batch != Batch() else []
-        self._waiting += len(batch.waiting) - sum(bool(record.vessel_id) for record in batch.finished)
         return list(zip(entries, numbers, strict=True))
 
     def forget(self) -> None:
@@ -343,7 +341,8 @@ class Archive:
     def _measure(self) -> None:
         self._images_bytes = self.shore.size_bytes()
         self._defects = self.shore.defect_counts()
-        self._waiting = self.shore.backlog.waiting_count()
+        with self.shore.database.transaction(writing=False) as sql:
+            self.shore.backlog.count_waiting(sql)
 
     def defect_counts(self) -> dict[str, int]:
         """Return the numbers of missing, changed, unreadable and conflicting records at the last measurement.
@@ -358,7 +357,7 @@ class Archive:
 
     def waiting_count(self) -> int:
         """Return the number of coded images that wait for the decoder."""
-        return self._waiting
+        return self.shore.backlog.waiting_count
 
     def fault(self) -> str:
         """Return why the archive cannot be used at present; empty if it can."""

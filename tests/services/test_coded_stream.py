@@ -343,5 +343,5 @@ def test_site_keeps_a_limited_number_of_versions(runner, start_c2, monkeypatch):
     eventually(lambda: relay.store.outbox_depth() == 0)
     names = c2.store.state_names("version/")
     assert len(names) <= 11
-    eventually(lambda: c2._archive.index().backlog.waiting_count() + c2.store.inbox_depth() == 30)
+    eventually(lambda: c2._archive.index().backlog.waiting_count + c2.store.inbox_depth() == 30)
     assert msgpack.unpackb(c2.store.get_state(names[0]))["u"] == "uuv-1"

@@ -57,9 +57,13 @@ class Backlog:
     Args:
         database: The database.
         owner: Identity of this c2 among those that share it.
+
+    Attributes:
+        waiting_count: Number of coded images that wait for the decoder of this c2, when they last changed.
     """
 
     def __init__(self, database: ShoreDatabase, owner: str) -> None:
+        self.waiting_count = 0
         self._database = database
         self._owner = owner
         self._insert = database.insert(BACKLOG)
@@ -73,6 +77,7 @@ class Backlog:
         """Delete accepted records that cannot be stored."""
         with self._database.transaction() as sql:
             self.delete(sql, records)
+            self.count_waiting(sql)
 
     def add_waiting(self, sql: sa.Connection, records: Sequence[BacklogRecord]) -> None:
         """Add coded images in an open transaction.
@@ -85,11 +90,8 @@ class Backlog:
 
     def count(self) -> int:
         """Return the number of records of all c2."""
-        return self._count(sa.select(sa.func.count()).select_from(BACKLOG))
-
-    def _count(self, chosen: sa.Select[Any]) -> int:
         with self._database.transaction(writing=False) as sql:
-            return int(sql.execute(chosen).scalar_one())
+            return int(sql.execute(sa.select(sa.func.count()).select_from(BACKLOG)).scalar_one())
 
     def waiting(self, vessel_id: str, after: int, limit: int) -> list[BacklogRecord]:
         """Return coded images of a vessel that wait for the decoder of this c2, in the order of acceptance."""
@@ -107,10 +109,10 @@ class Backlog:
         found = self._read(self._waiting().where(BACKLOG.c.id == id_))
         return found[0] if found else None
 
-    def waiting_count(self) -> int:
-        """Return the number of coded images that wait for the decoder of this c2."""
+    def count_waiting(self, sql: sa.Connection) -> None:
+        """Set `waiting_count` in an open transaction."""
         chosen = sa.select(sa.func.count()).where(BACKLOG.c.owner == self._owner, BACKLOG.c.is_coded)
-        return self._count(chosen)
+        self.waiting_count = int(sql.execute(chosen).scalar_one())
 
     def _waiting(self) -> sa.Select[Any]:
         b = BACKLOG.c

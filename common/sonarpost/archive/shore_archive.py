@@ -171,6 +171,8 @@ class ShoreArchive:
                 if batch.waiting:
                     self.backlog.add_waiting(sql, batch.waiting)
                 self.backlog.delete(sql, batch.finished)
+                if batch.waiting or batch.finished:
+                    self.backlog.count_waiting(sql)
                 # At last, because other c2 wait for it until the commit.
                 numbers = self.journal.number(sql, batch.numbered)
             self._written = []

@@ -87,7 +87,7 @@ class Backlog:
             thread.join()
 
     def waiting(self):
-        return self.archive.backlog.waiting_count()
+        return self.archive.backlog.waiting_count
 
 
 @pytest.fixture
