@@ -67,6 +67,7 @@ def cost(record, folder):
 @given(fields=parts())
 @example(fields={"u": "uuv-1", "i": "00A7", "n": 1, "t": 1.7e9, "h": 4096, "w": 4096})
 @example(fields={"u": "uuv-1", "i": "00A7", "n": 1, "t": 1.7e9, "h": 512, "w": 512, "z": MAX_STREAM_BYTES})
+@example(fields={"u": "uuv-1", "i": "00A7", "n": 1, "t": 1.7e9, "p": b'"2\xe0'})  # 512 px, all missing
 def test_record_costs_at_most_a_multiple_of_its_bytes(fields, tmp_path_factory):
     try:
         part = ImagePart.model_validate(fields)

@@ -29,9 +29,9 @@ def test_latest_image_version_is_exported(tmp_path):
 def test_masks_are_not_kept_in_memory(tmp_path):
     partial = image(missing_mask=b"\x80" * 48, complete=False, missing_fraction=0.125)
     (stored,) = load_contacts(store(tmp_path, partial)).contacts
-    assert (stored.image.missing_fraction, stored.image.missing_mask) == (0.125, "")
+    assert (stored.image.missing_fraction, stored.image.missing_runs) == (0.125, "")
     live = LiveContacts().add(partial)
-    assert (live.image.missing_fraction, live.image.missing_mask) == (0.125, "")
+    assert (live.image.missing_fraction, live.image.missing_runs) == (0.125, "")
 
 
 def test_latest_decision_is_exported_for_any_image_version(tmp_path):

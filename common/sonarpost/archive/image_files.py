@@ -7,8 +7,6 @@ another.
 
 from __future__ import annotations
 
-import base64
-import binascii
 import hashlib
 import json
 from collections.abc import Mapping, Set
@@ -20,7 +18,7 @@ from pydantic import ValidationError
 
 from sonarpost.archive.retention import remove_files, vehicle_source
 from sonarpost.errors import StoredFileError
-from sonarpost.export.contacts import ImageSideCar
+from sonarpost.export.contacts import ImageSideCar, mask_of_runs
 from sonarpost.export.contacts import side_car as side_car_fields
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import Pixels, ReconstructedImage
@@ -105,13 +103,15 @@ def stored_image(content: bytes, pixels: GreyImage, where: str) -> Reconstructed
     """
     try:
         stored = ImageSideCar.model_validate_json(content)
-        mask = base64.b64decode(stored.missing_mask, validate=True)
-        fields = stored.model_dump(exclude={"type", "v", "height_px", "width_px", "missing_mask"})
+        mask = mask_of_runs(stored.missing_runs, stored.height_px, stored.width_px)
+        fields = stored.model_dump(exclude={"type", "v", "height_px", "width_px", "missing_runs"})
         return ReconstructedImage(**fields, pixels=Pixels.from_array(pixels), missing_mask=mask)
     except ValidationError as error:
         raise StoredFileError(where, *first_error(error)) from error
-    except binascii.Error as error:
-        raise StoredFileError(where, "missing_mask", stored.missing_mask, f"base64 ({error})") from error
+    except ValueError as error:
+        raise StoredFileError(
+            where, "missing_runs", stored.missing_runs, f"the mask of its pixels ({error})"
+        ) from error
 
 
 def other_name(name: str, text: bytes) -> str:

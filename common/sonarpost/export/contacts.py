@@ -16,6 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Final, Literal, TypeVar
 
+import numpy as np
 from pydantic import Field, ValidationError
 
 from sonarpost.errors import BadInputError, StoredFileError
@@ -42,6 +43,7 @@ MAX_FILE_BYTES: Final = 1 << 22
 """Larger JSON files are rejected. The side-car of an image of 4096 x 4096 pixels is smaller."""
 
 DECISIONS: Final = "decisions"
+_RUN_BYTES: Final = 256
 
 R = TypeVar("R", bound=Record)
 N = TypeVar("N", int, float)
@@ -51,7 +53,8 @@ class ImageSideCar(Record):
     """JSON file beside a stored image: the `reconstructed_image` record without its pixels.
 
     Attributes:
-        missing_mask: `missing_mask` of the record in base64.
+        missing_runs: `missing_mask` of the record in base64, as pairs of bytes: one less than how often the second one
+            is repeated, at most to the next multiple of 256 bytes of the mask.
     """
 
     TYPE = "reconstructed_image"
@@ -69,7 +72,7 @@ class ImageSideCar(Record):
     complete: bool
     missing_fraction: Fraction
     missing_halves: tuple[Literal["top", "bottom"], ...]
-    missing_mask: str
+    missing_runs: str
     bytes_received: Count
     bytes_total: Count
     frames_received: Count
@@ -87,12 +90,39 @@ def side_car(image: ReconstructedImage) -> dict[str, object]:
     return {
         "type": image.TYPE,
         "v": image.VERSION,
-        **image.model_dump(exclude={"pixels"}),
-        "missing_mask": base64.b64encode(image.missing_mask).decode(),
+        **image.model_dump(exclude={"pixels", "missing_mask"}),
+        "missing_runs": _runs_of(image.missing_mask),
         "height_px": image.pixels.height_px,
         "width_px": image.pixels.width_px,
         "bits": image.pixels.bits,
     }
+
+
+def _runs_of(mask: bytes) -> str:
+    values = np.frombuffer(mask, dtype=np.uint8)
+    is_start = (np.arange(values.size) % _RUN_BYTES == 0) | (np.diff(values, prepend=np.uint8(0)) != 0)
+    starts = np.flatnonzero(is_start)
+    lengths = np.diff(starts, append=values.size)
+    return base64.b64encode(np.column_stack([lengths - 1, values[starts]]).astype(np.uint8).tobytes()).decode()
+
+
+def mask_of_runs(runs: str, height_px: int, width_px: int) -> bytes:
+    """Return the `missing_mask` of a record.
+
+    Args:
+        runs: `missing_runs` of its side-car.
+        height_px: Rows of the image.
+        width_px: Columns of the image.
+
+    Raises:
+        ValueError: The text is not the mask of such an image.
+    """
+    pairs = np.frombuffer(base64.b64decode(runs, validate=True), dtype=np.uint8).reshape(-1, 2)
+    lengths = pairs[:, 0].astype(np.int64) + 1
+    expected = (height_px * width_px + 7) // 8
+    if runs and lengths.sum() != expected:
+        raise ValueError(f"runs of {expected} bytes, not {lengths.sum()}")
+    return np.repeat(pairs[:, 1], lengths).tobytes()
 
 
 def contact_uid(image: ImageSideCar | ReconstructedImage) -> str:
@@ -109,7 +139,7 @@ class ExportContact:
     """One contact to export.
 
     Attributes:
-        image: Side-car of the latest version of its image, without `missing_mask`, which no export uses.
+        image: Side-car of the latest version of its image, without `missing_runs`, which no export uses.
         decisions: All decisions about it, oldest first.
         image_path: PNG of that version; None if the file is missing or only the contact record was received.
         size: Size as operators measured it; empty at the shore site, which receives no measurements.
@@ -195,7 +225,7 @@ class StoredRecords:
     """Files of the c2 service's folder.
 
     Attributes:
-        images: Side-car, without `missing_mask`, and path of every stored image version.
+        images: Side-car, without `missing_runs`, and path of every stored image version.
         decisions: All stored decisions.
         problems: One error for each rejected file.
     """
@@ -260,7 +290,7 @@ def read_stored_records(out_dir: Path) -> StoredRecords:
         for path in _json_files(folder, problems):
             image = _read(ImageSideCar, path, problems)
             if image is not None and _is_of_vessel(image, folder, path, problems):
-                images.append((image.model_copy(update={"missing_mask": ""}), path))
+                images.append((image.model_copy(update={"missing_runs": ""}), path))
         for path in _json_files(folder / DECISIONS, problems):
             decision = _read(Decision, path, problems)
             if decision is not None and _is_of_vessel(decision, folder, path, problems):

@@ -41,12 +41,12 @@ class LiveContacts:
         """Add a record; return the contact that it changed.
 
         Returns:
-            The contact without `image_path` and `missing_mask`; None for a repeated record, an older version, or a
+            The contact without `image_path` and `missing_runs`; None for a repeated record, an older version, or a
             decision about an image that has not arrived.
         """
         if isinstance(record, Decision):
             return self._add_decision(record)
-        return self._add_image(ImageSideCar.model_validate({**side_car(record), "missing_mask": ""}))
+        return self._add_image(ImageSideCar.model_validate({**side_car(record), "missing_runs": ""}))
 
     def located(self, limit: int) -> list[ExportContact]:
         """Return the most recently changed contacts with a position, at most `limit`, the latest last."""

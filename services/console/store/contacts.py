@@ -205,7 +205,7 @@ def _update_contact(db: sqlite3.Connection, contact_id: str, image: Reconstructe
     variable = {
         **{name: getattr(record, name, None) for name in _RECORD_COLUMNS},
         **{name: getattr(image, name) for name in ("version", "first_frame_utc_s", "bytes_received")},
-        "image": json.dumps({**side_car(image), "missing_mask": ""}),
+        "image": json.dumps({**side_car(image), "missing_runs": ""}),
         "range_m": record and record.ground_range_m,
         "vehicle_lat_deg": vehicle and vehicle[0],
         "vehicle_lon_deg": vehicle and vehicle[1],

@@ -1,6 +1,5 @@
 """c2: records of vessels are committed, stored in files and published; a vessel cannot send for another one."""
 
-import base64
 import hashlib
 import json
 
@@ -13,6 +12,7 @@ from builders.records import decision_record, reconstructed_image
 from builders.shore import relayed
 
 from sonarpost import keys, wire
+from sonarpost.export.contacts import mask_of_runs
 from sonarpost.files import AtomicFiles
 from sonarpost.messages import Contact, Pixels, ReceivedStatus, Relayed
 from sonarpost.services.c2.config import C2Config
@@ -69,7 +69,7 @@ def test_image_is_stored_and_published_as_plain_msgpack(begin, relay, image, out
     np.testing.assert_array_equal(read_image(out / "vessel-1" / f"{name}.tiff"), pixels)
     side = json.loads((out / "vessel-1" / f"{name}.json").read_text())
     assert side["pixels_sha256"] == sent.pixels_sha256
-    assert base64.b64decode(side["missing_mask"]) == sent.missing_mask
+    assert mask_of_runs(side["missing_runs"], *pixels.shape) == sent.missing_mask
     eventually(lambda: relay.store.outbox_depth() == 0)
     eventually(lambda: service.health().counters == {"records_handled": 1, "images_stored": 1})
     check_monitoring(service)

@@ -166,7 +166,7 @@ def test_files_and_record_hold_the_same_image(begin, runner, decoded, stream, ou
     whole = (out / f"{name}.json").read_bytes()
     side = json.loads(whole)
     assert side["pixels_sha256"] == image.pixels_sha256
-    assert (side["image_id"], side["contact"]["lat_deg"], side["missing_mask"]) == ("0A1B", 56.4, "")
+    assert (side["image_id"], side["contact"]["lat_deg"], side["missing_runs"]) == ("0A1B", 56.4, "")
     assert (side["height_px"], side["width_px"], side["bits"]) == (40, 60, 8)
     # A damaged side car is written again.
     runner.stop(service)
