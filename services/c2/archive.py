@@ -9,6 +9,8 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextvars import copy_context
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
@@ -82,6 +84,7 @@ class Archive:
         self._is_open = False
         self._batch = Batch()
         self._entries: list[JournalEntry] = []
+        self._logs: list[Callable[[], None]] = []  # to write after the commit
         self._defects = dict.fromkeys(DEFECTS, 0)
         self._images_bytes = 0
         self._take_over_records = TAKE_OVER_RECORDS
@@ -141,7 +144,7 @@ class Archive:
         """Add an image to the next `flush`; a different image with the same file name stays."""
         self.index()
         written = self._add_image(image, relayed_utc_s, time.time())
-        _log_image(image, relayed_utc_s, written)
+        self._logs.append(partial(copy_context().run, _log_image, image, relayed_utc_s, written))
         return written
 
     def _add_image(self, image: ReconstructedImage, relayed_utc_s: float | None, accepted_utc_s: float) -> WrittenImage:
@@ -206,7 +209,8 @@ class Archive:
         """
         self.index()
         is_new = self._add_decision(decision, time.time())
-        log.info("Decision stored", extra=kv(vessel=decision.vessel_id, verdict=decision.verdict))
+        fields = kv(vessel=decision.vessel_id, verdict=decision.verdict)
+        self._logs.append(partial(copy_context().run, log.info, "Decision stored", extra=fields))
         return is_new
 
     def _add_decision(self, decision: Decision, accepted_utc_s: float) -> bool:
@@ -247,15 +251,17 @@ class Archive:
         return self._commit(lambda entry: entry.columns(now_utc_s))
 
     def _commit(self, columns: Callable[[JournalEntry], dict[str, Any]]) -> list[tuple[JournalEntry, Accepted]]:
-        batch, self._batch = self._batch, Batch()
-        entries, self._entries = self._entries, []
+        batch, entries, logs = self._batch, self._entries, self._logs
+        self.forget()
         batch.numbered = [columns(entry) for entry in entries]
         numbers = self.shore.write(batch) if batch != Batch() else []
+        for write_log in logs:
+            write_log()
         return list(zip(entries, numbers, strict=True))
 
     def forget(self) -> None:
         """Drop the records since the last `flush`."""
-        self._batch, self._entries = Batch(), []
+        self._batch, self._entries, self._logs = Batch(), [], []
 
     def store_state(self, item: Tasking) -> tuple[JournalEntry, Accepted]:
         """Store the state of a comment or command, and return its number."""

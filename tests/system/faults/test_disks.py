@@ -65,10 +65,10 @@ def test_sender_keeps_images_while_the_vessel_disk_is_full(disk, start_system):
 
 
 def test_images_stay_in_the_store_while_the_shore_image_disk_is_full(disk, start_system):
-    small = disk(4_000)
+    small = disk(8_000)
     system = start_system(shore_out=small.folder / "out")
     system.watch_health()
-    system.send([make_image(n, (60, 80)) for n in range(COUNT)])  # 4 MB of files, 1 MB in the journal
+    system.send([make_image(n, (60, 80)) for n in range(COUNT)])  # 4 MB of files, up to 5 MB of archive.db
     system.wait_for_state("c2", "degraded", "No space left|disk is full")
     system.wait_until(lambda: system.depths("relay")["outbox"] == 0, "c2 has accepted all")
     system.history.fault("disk", "full")
