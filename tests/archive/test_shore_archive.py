@@ -262,3 +262,13 @@ def test_kill_before_or_after_the_commit_leaves_nothing_or_everything(tmp_path, 
     if not before:
         assert [result.fault for result in archive.verify(1e9, 86400.0, 86400.0)] == ["", ""]
     archive.close()
+
+
+def test_no_connection_outlives_the_end(archive):
+    with archive.database.transaction() as sql:
+        used = sql.connection
+        archive.close()
+        assert used.is_valid
+    assert not used.is_valid
+    with pytest.raises((OSError, DatabaseUnavailableError), match="closed"):
+        archive.images()

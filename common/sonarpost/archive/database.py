@@ -54,7 +54,9 @@ class ShoreDatabase(ABC):
         self._site = site
         self._is_prepared = False
         self._prepare_lock = threading.RLock()
+        self._is_closed = False
         sa.event.listens_for(engine, "handle_error")(self._on_error)
+        sa.event.listens_for(engine, "checkin")(self._on_checkin)
 
     def prepare(self) -> None:
         """Create the tables, or check their version.
@@ -91,6 +93,8 @@ class ShoreDatabase(ABC):
             OSError, DatabaseUnavailableError: It cannot be used at present. Whether a failed commit has taken effect is
                 unknown.
         """
+        if self._is_closed:
+            raise self.unavailable(f"{self.where}: closed")
         try:
             self.prepare()
         except (StoredFileError, ConfigError) as error:
@@ -117,8 +121,13 @@ class ShoreDatabase(ABC):
             yield sql
 
     def close(self) -> None:
-        """Close the connections."""
+        """Close the connections; those of open transactions are closed at their end."""
+        self._is_closed = True
         self._engine.dispose()
+
+    def _on_checkin(self, _connection: object, record: sa.pool.ConnectionPoolEntry) -> None:
+        if self._is_closed:
+            record.invalidate()
 
     def _on_error(self, context: sa.engine.ExceptionContext) -> Exception | None:
         error = context.original_exception
