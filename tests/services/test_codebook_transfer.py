@@ -130,7 +130,7 @@ def test_images_that_wait_are_limited(image, start_c2, send, refused, monkeypatc
         send(image[1].model_copy(update={"image_id": f"000{number}"}))
     eventually(lambda: len(refused(c2)) == 1)
     assert MODEL in refused(c2)[0][1]
-    assert c2.health().gauges["images_undecoded"] == 2.0
+    eventually(lambda: c2.health().gauges["images_undecoded"] == 2.0)
 
 
 SIZE = 16 * 1024 * 1024
