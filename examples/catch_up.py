@@ -1,7 +1,5 @@
 """Prints every record of a shore site once, also those missed: catch_up.py tcp/127.0.0.1:7447 [CURSOR_FILE]."""
 
-from __future__ import annotations
-
 import json
 import pathlib
 import queue

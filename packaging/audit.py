@@ -4,8 +4,6 @@ Exit status 1: a package has a known vulnerability. A package that the service d
 not reached, is printed and leaves the exit status at 0.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -4,8 +4,6 @@ Fails if a module of sonarpost cannot be imported or a codec does not work. Prin
 compiled codecs.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import pkgutil

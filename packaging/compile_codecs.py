@@ -7,8 +7,6 @@ NUMBA_CPU_NAME=generic the module works on any processor of the architecture. Af
 removed from the installation.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """Draw the PNG icons of the console's web manifest, as in `icon.svg`: `python packaging/console_icons.py`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from PIL import Image, ImageDraw

@@ -1,7 +1,5 @@
 """Print the coverage of each package and the modules below 70 %: packaging/coverage_by_package.py COVERAGE.json."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections import defaultdict

@@ -8,8 +8,6 @@ checkout. There, the quick tests that execute the function run; a run with cover
 A fault that they do not catch is printed; `--keep NUMBER` leaves it in the copy, for a run of other tests.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import os

@@ -4,8 +4,6 @@ ENVIRONMENT is a virtual environment with the packages of LOCK and nothing else.
 list the packages of LOCK in the same versions. The product is the main component of the document, not a package.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -3,8 +3,6 @@
 Needs Debian's Chromium (apt-get install chromium), or another one that SONARPOST_CHROMIUM names.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

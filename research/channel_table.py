@@ -3,8 +3,6 @@
 All figures are counts of packets sent one after the other through the simulated channel.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass

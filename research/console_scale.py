@@ -7,8 +7,6 @@ event stream while new versions of images are published, as the decompressor doe
 The time to draw the page is not included: `python -m research.console_screen` measures it.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import statistics

@@ -7,8 +7,6 @@ are published as the decompressor does. A time ends with the animation frame aft
 those of this host.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil

@@ -16,8 +16,6 @@ Keys, attachments and headers of the transport are not included. The exit status
 was refined that often.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -30,8 +30,6 @@ the CPU usage of all processes of the host and of this benchmark. The exit statu
 and arrived once at the shore site with the correct sha256.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

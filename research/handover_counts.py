@@ -16,8 +16,6 @@ service is measured, without the codec (coding_ms) and without what the idle cha
 With `--old`, the sources of another checkout are measured in turn with these, and the ratios are printed.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

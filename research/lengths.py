@@ -9,8 +9,6 @@ The length is the axis of a cylinder. Spheres, cones and wedges are about as lon
 is closest to the track's direction, and all of that side is insonified. The width is the side perpendicular to it.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

@@ -1,7 +1,5 @@
 """A vessel's relay whose routers reach shore sites over emulated links, and the drain of its records."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence

@@ -5,8 +5,6 @@ each side in `surveys/derived` (row = ping, column = sample, port farthest first
 files. README.md#data states where to get the recordings.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import hashlib

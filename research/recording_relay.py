@@ -6,8 +6,6 @@ last frame, and `acknowledged_utc_s`, when the relay starts to remove the record
 transaction that removes the record: if that is repeated, a second object has the same `seq`.
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Iterator

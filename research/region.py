@@ -5,8 +5,6 @@ The vessel has the first bytes of the stream of the whole image (`--base`). Furt
 side information at the start of a stream, so a stream that has begun cannot be continued with one.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from pathlib import Path

@@ -25,8 +25,6 @@ One JSON object a line. The exit status is 0 if the ratios reach 4 times NATS an
 NATS for coded images; those of skipped peers do not count.
 """
 
-from __future__ import annotations
-
 import argparse
 import cProfile
 import json

@@ -5,8 +5,6 @@ Gaussian that makes it most similar to the decoded image (least squares); the fu
 maximum is the smallest detail. The command prints the table of `sonarpost.review.resolution`.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import statistics

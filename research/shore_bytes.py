@@ -7,8 +7,6 @@ refinement. Printed are the mean bytes of a payload for each version, and of pay
 query that carries it alone. Headers of the transport are not included.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from hashlib import sha256

@@ -6,8 +6,6 @@ Encodes simulated contacts, sends them with the sender and receiver of `sonarpos
 messages, bytes and time. The exit status is 1 if a record is missing or arrived twice.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import sys

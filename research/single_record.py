@@ -13,8 +13,6 @@ c2 publishes it in coded form, before it is decoded. All times are in millisecon
 One JSON object; the exit status is 0 if the subscriber has received each record once.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

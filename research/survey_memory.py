@@ -9,8 +9,6 @@ as the vehicle does (at most 20 contacts a file). Prints the peak resident memor
 the files afterwards.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

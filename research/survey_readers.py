@@ -8,8 +8,6 @@ the peak resident memory of the process, and the speed of reading. Waterfall ima
 number of pings is limited to 60,000. Deletes the files afterwards.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import subprocess

@@ -16,8 +16,6 @@ relay delivers to a c2 that only commits records. Printed are
 Headers of TCP and IP are not included. The exit status is 0 if c2 has acknowledged every contact.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import sys

@@ -29,8 +29,6 @@ The exit status is 0 if every record arrives once and the aims are met: in drain
 arrives again; decisions are acknowledged within 3 s; the other site takes at most 1.1 of the time.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging

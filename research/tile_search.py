@@ -14,8 +14,6 @@ compared with integer distances and must be exact. FAISS runs with the faster of
 matrix product), which is measured beforehand.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

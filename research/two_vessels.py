@@ -5,8 +5,6 @@ channels. The frames of the second one reach the lead vessel later. Measured are
 feedback, and the air time until all images are complete with feedback: for each vessel alone, and merged.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -5,8 +5,6 @@ Transmit queue, medium access, driver, modem and serial line are those of a vehi
 that sends feedback in the receive windows.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

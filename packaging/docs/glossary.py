@@ -1,7 +1,5 @@
 """Links from the first use of each term on a page to the glossary; anchors in the glossary."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """The drawing of the packages of `sonarpost` and their imports, on the page of the architecture."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping, Sequence
 from itertools import pairwise

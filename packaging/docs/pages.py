@@ -1,7 +1,5 @@
 """MkDocs hooks: adds pages that are files outside `docs`, rewrites their links, links terms and fills in the tables."""
 
-from __future__ import annotations
-
 import logging
 import re
 import sys

@@ -1,7 +1,5 @@
 """Tables of the page on modem rates, computed from the modem driver, the frame formats and the channel model."""
 
-from __future__ import annotations
-
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition, frame_error_rate
 from sonarpost.extensions.simulation.channel.model import ChannelModel
 from sonarpost.extensions.simulation.channel.parameters import build_parameters

@@ -1,7 +1,5 @@
 """Tables of the reference pages, made from code: records, keys, configuration, commands, modem rates and packages."""
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import json

@@ -1,7 +1,5 @@
 """`python -m research.codebook`: build (the paper's Table IV), show, compare and adapt tile codebooks."""
 
-from __future__ import annotations
-
 import argparse
 import re
 import sys

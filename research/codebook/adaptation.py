@@ -16,8 +16,6 @@
 Images are loaded each time they are needed. Memory holds tiles and one number for each training tile.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ held-out last quarter is the end of the line on both sides. Both codebooks are a
 time, which does not depend on the load of the machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

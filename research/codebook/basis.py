@@ -1,7 +1,5 @@
 """The basis of a codebook: principal components of its own tiles."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sonarpost.codec.vq.tiles import BASIS_SCALE, MAX_DIMS, Basis, TileDatabase, Tiles

@@ -7,8 +7,6 @@
 and peak resident memory are printed. The simulation is not included.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -16,8 +16,6 @@ Memory does not depend on the number of images: one is held at a time. A build n
 pixel of the maximum number of tiles, and 100 bytes for each pixel of the largest image, plus the libraries.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Differences of two codebooks: tiles that only one has, distances of the others, and angles of the bases."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

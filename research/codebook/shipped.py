@@ -10,8 +10,6 @@ A0, the number of samples (u32, big endian) and the byte 21. The samples follow,
 port, B003 is starboard.
 """
 
-from __future__ import annotations
-
 import argparse
 import struct
 import sys

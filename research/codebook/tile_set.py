@@ -1,7 +1,5 @@
 """A set of tiles that grows while a codebook is built, with the exact search of the codec."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

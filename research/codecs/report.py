@@ -1,7 +1,5 @@
 """Report of `python -m research.codecs`: tables as text, one JSON object, and rate differences between the codecs."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

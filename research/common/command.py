@@ -1,7 +1,5 @@
 """Argument parsing, error handling and progress output of the research commands."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Sequence

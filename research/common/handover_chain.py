@@ -1,7 +1,5 @@
 """One chain of `sonarpost demo`, counted or timed; `research.handover_counts` runs it with the sources of a tree."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -4,8 +4,6 @@ Each process writes its counters to a file of its own in the folder HANDOVER_COU
 module. They are in shared memory of the file: a process that is killed has written them as well.
 """
 
-from __future__ import annotations
-
 import importlib.abc
 import importlib.machinery
 import mmap

@@ -8,8 +8,6 @@ train split first, so the 138 crops of the test split are always those of the pu
 Targets are lossless PNG, most other tiles JPEG: figures from them compare codecs with one another only.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 import math

@@ -1,7 +1,5 @@
 """Two modem drivers with emulated modems in a simulated channel, on a simulated clock."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition

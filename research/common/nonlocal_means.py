@@ -4,8 +4,6 @@
 does not use it.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

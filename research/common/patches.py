@@ -5,8 +5,6 @@ if the line were sampled more coarsely. Windows are mirrored in turn (port and s
 directions) and mapped to one of several tones (dark with one bright target, or bright all over).
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

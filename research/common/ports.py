@@ -1,7 +1,5 @@
 """Free TCP ports for the services of a research command."""
 
-from __future__ import annotations
-
 import socket
 from contextlib import suppress
 from random import SystemRandom

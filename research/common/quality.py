@@ -1,7 +1,5 @@
 """Image quality: PSNR, SSIM and MS-SSIM."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

@@ -3,8 +3,6 @@
 Sizes in pixels are pings along the track (rows) and samples of slant range (columns, nadir to the left).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Both snippets of a pair have the grey scale of the one with speckle:
 grey = amplitude * min(255 / 99.5th percentile of the amplitude, 8), limited to 0..255.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Statistics: bootstrap intervals, the Bjøntegaard rate difference, the area under a ROC curve."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

@@ -1,7 +1,5 @@
 """`python -m research.despeckling`: the network of emb against classical filters, alone and as the input of emb."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

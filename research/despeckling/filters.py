@@ -13,8 +13,6 @@ with seed 9, which no published figure uses. The mean of a logarithm is below th
 of the logarithm scale their result to the mean intensity of the input.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final
 

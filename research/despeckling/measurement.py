@@ -1,7 +1,5 @@
 """Measurement of a despeckling filter: the filtered image, and the images that emb decodes after it."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """Report of `python -m research.despeckling`: tables as text, or one JSON object."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """`python -m research.detection`: detection rate, false alarms, and the effect of each codec on the confidence."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

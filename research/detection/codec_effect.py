@@ -5,8 +5,6 @@ again. Place and seabed are the same, so only the coding differs. The confidence
 put back uncoded, which includes the loss of the mapping to grey levels.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -11,8 +11,6 @@ confidence. The model is a logistic regression of "is found" for all thresholds 
 weights of 0 or more and offsets that do not increase with the threshold.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

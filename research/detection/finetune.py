@@ -12,8 +12,6 @@ surveys. The result is a file with an identity; nothing installs it. To use it, 
 Requires PyTorch (CPU), which is not a dependency of the package.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

@@ -1,7 +1,5 @@
 """Evaluation of the detector on simulated surveys that were not used for training."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Evaluation of the detector on the tiles of the SDVD data set: tiles with a target against tiles without."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """`python -m research.link`: quality of images over a lossy channel, by transmission scheme, at equal bytes."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -5,8 +5,6 @@ module implements the paper's method: one rotation matrix, database and search i
 that 10 to 100 dimensions can be compared.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

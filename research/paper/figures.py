@@ -1,7 +1,5 @@
 """The paper's Table II and Fig. 2, measured with the codecs of this package at the paper's sizes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,8 +4,6 @@ Each module starts two servers of one system: a sender, where the records wait o
 them. Both write a record to disk before they acknowledge it, as the relay and c2 do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path

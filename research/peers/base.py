@@ -1,7 +1,5 @@
 """What the benchmarks do with every peer: start its two servers, fill the sender, measure the drain to the receiver."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

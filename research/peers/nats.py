@@ -5,8 +5,6 @@ continues after the last sequence number that it has stored. By default, a leaf 
 link with a round trip of more than 10 ms.
 """
 
-from __future__ import annotations
-
 import json
 import socket
 import time

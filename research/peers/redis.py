@@ -6,8 +6,6 @@ to the stream of the receiver, and deletes them at the sender when the receiver 
 and sends the same entries; the receiver rejects an identifier that is not larger than its last one.
 """
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """`python -m research.recognition`: how well a classifier trained on originals recognises targets after coding."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -9,8 +9,6 @@ Streams of `emb` may describe the texture of the bottom (grain). The decoder can
 strength to the image; the pixelser chooses its share.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Protocol, runtime_checkable

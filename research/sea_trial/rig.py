@@ -4,8 +4,6 @@ Except for the channel, this is the software of a vehicle and a vessel: packets 
 format, NMEA on both serial lines, the receiver of the paper's format. The clock is simulated, from event to event.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final

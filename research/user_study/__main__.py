@@ -1,7 +1,5 @@
 """`python -m research.user_study`: serve the user study, or print its results."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

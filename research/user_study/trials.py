@@ -3,8 +3,6 @@
 A participant sees each decoded image once, in random order, and selects its original among several.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Reading contacts from the c2 service's folder: latest version, latest decision, rejected files."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

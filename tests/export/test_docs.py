@@ -1,7 +1,5 @@
 """The program in docs/reference/exports.md runs."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

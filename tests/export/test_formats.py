@@ -1,7 +1,5 @@
 """Export formats: agreement with their specifications, and escaping of untrusted text."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

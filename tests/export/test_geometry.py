@@ -1,7 +1,5 @@
 """Lines and polygons at the 180th meridian: every part is on one side, and together they are the whole."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """GeoPackage of contacts."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 import subprocess

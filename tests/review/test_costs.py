@@ -1,7 +1,5 @@
 """Estimate of the arrival of answers to requests."""
 
-from __future__ import annotations
-
 import pytest
 
 from sonarpost.modem.micromodem import RATES

@@ -1,7 +1,5 @@
 """Ends of a line at half brightness, on bars of known extent."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter

@@ -1,7 +1,5 @@
 """UDP multicast ports on the loopback interface, and two stations that use them."""
 
-from __future__ import annotations
-
 import queue
 
 import pytest

@@ -1,7 +1,5 @@
 """Health and log of a service with a modem that does not transmit, reports too much or sends garbage."""
 
-from __future__ import annotations
-
 import fcntl
 import logging
 import os

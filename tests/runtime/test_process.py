@@ -1,7 +1,5 @@
 """Service process: stops on a signal, reports errors in one line, ends with its parent."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

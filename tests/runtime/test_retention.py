@@ -1,7 +1,5 @@
 """Time that retention uses: the start and a step of the wall clock take effect after a day."""
 
-from __future__ import annotations
-
 import pytest
 
 from sonarpost.archive.retention import EARLIEST_UTC_S

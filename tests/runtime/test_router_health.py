@@ -1,7 +1,5 @@
 """Health of a service whose router is not reached: why, before the first connection and after a loss."""
 
-from __future__ import annotations
-
 import time
 from concurrent.futures import ThreadPoolExecutor
 

@@ -1,7 +1,5 @@
 """SerialModem against two emulated modems on pseudo-terminals."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor

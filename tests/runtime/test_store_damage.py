@@ -1,7 +1,5 @@
 """A service whose store has lost commits, or states that cannot be read, is degraded."""
 
-from __future__ import annotations
-
 from sonarpost.cli.main import main as sonarpost
 from sonarpost.services.relay.config import RelayConfig
 from sonarpost.services.relay.service import RelayService

@@ -1,7 +1,5 @@
 """Codecs to compare with: those of the paper, and formats of today. `comparison_registry` lists all codecs."""
 
-from __future__ import annotations
-
 from functools import cache
 
 from research.codecs.baselines.huffman import HuffmanCodec

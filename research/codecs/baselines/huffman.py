@@ -14,8 +14,6 @@ Body, most significant bit first: n - 1 (u8); kind (u8); levels; code lengths; t
   canonical.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass

@@ -15,8 +15,6 @@ for each number of decompositions, and sends the candidate nearest to the origin
 A truncated codestream is rejected, unless OpenJPEG finds all packets complete.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -16,8 +16,6 @@ Libraries allocate memory for the size in the data, so the decoder first compare
 format decodes a truncated body.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import io

@@ -7,8 +7,6 @@ Replaces most images of a pool of `research.training.emb.pool` by simulated ones
 the scene of each image: the simulated one, else the estimate. The enhancer of the decoder is trained against it.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

@@ -8,8 +8,6 @@ and a grey mapping; some get thin bright lines and points. Pairs of neighbouring
 their noise is independent, so one predicts the scene of the other (Lehtinen et al., "Noise2Noise", 2018).
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import sys

@@ -6,8 +6,6 @@ Requires PyTorch (CPU), which is not a dependency of the package. The loss is th
 without speckle, so that the network estimates the conditional mean.
 """
 
-from __future__ import annotations
-
 import argparse
 import copy
 import math

@@ -8,8 +8,6 @@ The most confident candidate of each place counts, as in the detector. The confi
 that density of objects and with equal shares of the seabeds.
 """
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 from pathlib import Path

@@ -8,8 +8,6 @@ noise, unknown borders, unknown geometry. The loss is the cross-entropy with smo
 exponential moving average of the weights. `--start` continues from weights that exist.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from pathlib import Path

@@ -6,8 +6,6 @@
 Loss: squared error relative to that before enhancement, minus the weighted multi-scale structural similarity.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable, Sequence

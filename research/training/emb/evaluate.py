@@ -5,8 +5,6 @@
 The figures are those of `python -m research.codecs --sdvd`, without misses and intervals.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

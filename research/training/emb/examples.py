@@ -1,7 +1,5 @@
 """Training examples: the binary decisions of the coder with their contexts, listed by the coder itself."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

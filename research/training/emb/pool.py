@@ -7,8 +7,6 @@ Highlights with shadows are added to half of the images. Validation images come 
 the last fifth of every recording, every sixth tile, other seeds of the simulator.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

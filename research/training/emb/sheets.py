@@ -7,8 +7,6 @@
 The images may be published: they are from the public-domain Humminbird recording (its last fifth) and the simulator.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence

@@ -6,8 +6,6 @@
 The scales were chosen on validation images; see docs/explanation/codecs.md.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

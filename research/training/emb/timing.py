@@ -5,8 +5,6 @@ OMP_NUM_THREADS=1 python -m research.training.emb.timing
 Prints medians over the snippets. The time of a snippet is the least of three runs.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -5,8 +5,6 @@
 Requires jax and optax (CPU), which are not dependencies of the package.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Fixtures of these tests from `builders.console`."""
 
-from __future__ import annotations
-
 from builders.console import console, fast_password_hashes, make_console, make_shared_console, users_file
 
 __all__ = ["console", "fast_password_hashes", "make_console", "make_shared_console", "users_file"]

@@ -1,7 +1,5 @@
 """docs/specifications/console-api.md names all routes and fields of responses."""
 
-from __future__ import annotations
-
 import re
 
 from builders.common import REPOSITORY

@@ -1,7 +1,5 @@
 """The chain of places between an operator and the vehicles."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Every transaction that changes what is shown of a contact publishes exactly one event about it."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import time

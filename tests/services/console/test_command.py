@@ -1,7 +1,5 @@
 """`sonarpost console`: users, the view of a folder, and the web server with TLS."""
 
-from __future__ import annotations
-
 import io
 import json
 import signal

@@ -1,7 +1,5 @@
 """Limits of connections, with a real server: half-open, idle and slow clients do not keep others out."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import math

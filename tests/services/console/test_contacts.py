@@ -1,7 +1,5 @@
 """Queries of the contacts: the indexes that keep them fast with 50,000 contacts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

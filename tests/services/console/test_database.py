@@ -1,7 +1,5 @@
 """The files of the console in SQLite: their schema versions."""
 
-from __future__ import annotations
-
 import re
 import sqlite3
 from contextlib import closing

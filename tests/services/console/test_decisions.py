@@ -1,7 +1,5 @@
 """Decisions of the console: take-back time, undo, disputes, overruling, notices, classes."""
 
-from __future__ import annotations
-
 import pytest
 from builders.console import Clock, comment_record, contact_id, image_record
 from builders.records import decision_record

@@ -1,7 +1,5 @@
 """The event stream over a real connection, and its buffer."""
 
-from __future__ import annotations
-
 import json
 import urllib.error
 import urllib.request

@@ -1,7 +1,5 @@
 """Exports with their limits, and the printable report."""
 
-from __future__ import annotations
-
 import csv
 import io
 import os

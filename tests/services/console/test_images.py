@@ -1,7 +1,5 @@
 """Rendering of images, and measurements on them."""
 
-from __future__ import annotations
-
 import io
 import math
 from itertools import product

@@ -1,7 +1,5 @@
 """What the console states about the received data of an image: stage, air time, resolution, invented texture."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

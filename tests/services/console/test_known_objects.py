@@ -1,7 +1,5 @@
 """Contacts with known objects: nothing is revealed before a decision, nothing about sealed ones is sent, the score."""
 
-from __future__ import annotations
-
 import io
 import re
 import zipfile

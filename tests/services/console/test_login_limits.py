@@ -1,7 +1,5 @@
 """Log-in: limits of wrong passwords, known browsers, number of sessions, and password hashes."""
 
-from __future__ import annotations
-
 import hashlib
 import ssl
 import threading

@@ -1,7 +1,5 @@
 """Log-in links: valid once and for ten minutes, limited, stored as a hash, and in no log."""
 
-from __future__ import annotations
-
 import logging
 import re
 

@@ -1,7 +1,5 @@
 """Map and fleet."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Objects of the console: association in the database, one verdict for all looks, changes by a person, flags."""
 
-from __future__ import annotations
-
 import json
 import random
 

@@ -1,7 +1,5 @@
 """Files of the page: the browser loads all scripts at once, and there are no others."""
 
-from __future__ import annotations
-
 import re
 
 from sonarpost.services.console.web.server import STATIC, imported_scripts

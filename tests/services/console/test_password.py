@@ -1,7 +1,5 @@
 """Password change by users: errors, end of other sessions, and no password in files or logs."""
 
-from __future__ import annotations
-
 import logging
 import re
 

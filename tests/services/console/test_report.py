@@ -1,7 +1,5 @@
 """Report and target sheets: facts in words, lines, training mark, limits."""
 
-from __future__ import annotations
-
 import pytest
 from builders.console import contact_id, image_record
 from starlette.testclient import TestClient

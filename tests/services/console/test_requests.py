@@ -1,7 +1,5 @@
 """Results of requests, what a vehicle cannot do, and images that answer requests as layers of their contact."""
 
-from __future__ import annotations
-
 import pytest
 from builders.console import FIRST_UTC_S, Clock, contact_id, downlink_state, image_record, partial_record
 

@@ -1,7 +1,5 @@
 """Retention of the images in the console's database."""
 
-from __future__ import annotations
-
 import time
 
 from builders.console import image_record

@@ -1,7 +1,5 @@
 """The shipped configuration of nginx, with a real nginx on the local host."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

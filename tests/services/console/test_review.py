@@ -1,7 +1,5 @@
 """Contact lists, image versions, groups, decisions, undo, audit, requests and comments."""
 
-from __future__ import annotations
-
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
 from itertools import count

@@ -1,7 +1,5 @@
 """Sessions, roles, log-in limits, and hostile input."""
 
-from __future__ import annotations
-
 import json
 import logging
 import re

@@ -1,7 +1,5 @@
 """The console service with its neighbours: received records, sent records, health."""
 
-from __future__ import annotations
-
 import sqlite3
 import threading
 import time

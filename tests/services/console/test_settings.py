@@ -1,7 +1,5 @@
 """Settings of users: stored for each user, limited in names and size."""
 
-from __future__ import annotations
-
 import pytest
 
 from sonarpost.services.console.web.session_routes import MAX_VALUE, SETTINGS

@@ -1,7 +1,5 @@
 """Shares of the users in the threads of the server: one user does not delay the others."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 from concurrent.futures import ThreadPoolExecutor

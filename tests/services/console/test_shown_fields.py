@@ -1,7 +1,5 @@
 """Authentication, class and despeckling of contacts in lists, versions, map, exports and report, and where unknown."""
 
-from __future__ import annotations
-
 import csv
 import io
 

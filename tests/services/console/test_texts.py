@@ -1,7 +1,5 @@
 """Texts of the page: one catalogue, complete in every language."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import get_args

@@ -1,7 +1,5 @@
 """Statuses of vehicles: track, latest position, surveyed area, limits."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest

@@ -1,7 +1,5 @@
 """Fixtures of these tests: the service of vessel-1 with short delays, and its consumer."""
 
-from __future__ import annotations
-
 import pytest
 
 from sonarpost import keys

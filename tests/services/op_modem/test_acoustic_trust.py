@@ -1,7 +1,5 @@
 """op_modem with the shipped configuration, set up by the documentation: frames without the key change nothing."""
 
-from __future__ import annotations
-
 from random import Random
 
 import pytest

@@ -1,7 +1,5 @@
 """op_modem with v1: commands and feedback reach a vehicle through emulated modems, also after losses and restarts."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Limits on the images of each vehicle and hour: what exceeds them waits, and is neither lost nor reordered."""
 
-from __future__ import annotations
-
 from builders.acoustic_attack import LONDON, PREFIX, forged_contact
 from builders.common import eventually
 from builders.vessel_frames import packet

@@ -1,7 +1,5 @@
 """Two vessels receive the same vehicle: the lead vessel merges their frames, and refuses those of other senders."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import pytest

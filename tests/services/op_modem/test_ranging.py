@@ -1,7 +1,5 @@
 """Distances to the vehicles from pings: which vehicle and when, accepted answers, the record."""
 
-from __future__ import annotations
-
 import pytest
 from builders.common import eventually
 

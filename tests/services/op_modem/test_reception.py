@@ -1,7 +1,5 @@
 """op_modem: receives all frames, assembles images, loses and repeats nothing across kills, full disks and restarts."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Fixtures of these tests: the service, and a service that sends it records."""
 
-from __future__ import annotations
-
 import pytest
 
 from sonarpost.delivery.store import Store

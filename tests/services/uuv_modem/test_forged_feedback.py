@@ -1,7 +1,5 @@
 """Forged feedback: two false messages of 23 bytes end a queue without authentication, and change nothing with it."""
 
-from __future__ import annotations
-
 import pytest
 from builders.authentication_world import key
 from builders.records import encoded_image

@@ -1,7 +1,5 @@
 """uuv_modem with the `paper` wire format: every frame is sent in order and once, also after restarts and faults."""
 
-from __future__ import annotations
-
 import json
 import math
 

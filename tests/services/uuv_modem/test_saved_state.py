@@ -1,7 +1,5 @@
 """State of uuv_modem: failed commits, and a change of the wire format."""
 
-from __future__ import annotations
-
 from itertools import groupby
 from operator import itemgetter
 

@@ -1,7 +1,5 @@
 """The vehicle's status: which one is sent and when, on its way to the vessel, and hostile ones there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgpack

@@ -1,7 +1,5 @@
 """A verdict stops the rest of an image: the vehicle's and the vessel's endpoints with a channel between them."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import pytest

@@ -1,7 +1,5 @@
 """uuv_modem: the times of its transmissions, from the modem's reports and without them."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

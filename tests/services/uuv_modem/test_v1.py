@@ -1,7 +1,5 @@
 """uuv_modem with the `v1` wire format: previews first, messages, commands, authentication, restarts and full disks."""
 
-from __future__ import annotations
-
 import sqlite3
 import time
 from contextlib import closing
