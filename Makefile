@@ -71,7 +71,6 @@ check: $(DEV) docs
 	$(BIN)/lint-imports
 	$(DENO) check $(SCRIPTS)
 	$(DENO) lint $(SCRIPTS) services/console/static/service_worker.js
-	$(BIN)/python tests/check_wheel.py
 
 # The images of docker-compose.yml; without an image registry they are built from Debian and PyPI. If debootstrap is needed
 # and not installed, `make images INSTALL=yes` installs it on this host.

@@ -1,10 +1,11 @@
-"""The wheel in an empty environment: without extras, and with other versions of Python."""
+"""The wheel: its files, and its use in an empty environment, without extras and with other versions of Python."""
 
 import importlib.metadata
 import json
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,29 @@ def wheel(tmp_path_factory):
     subprocess.run(command, check=True, capture_output=True)
     [path] = folder.glob("*.whl")
     return path
+
+
+LEAFLET = "sonarpost/services/console/static/vendor/leaflet/"
+SUFFIXES = ".py .typed .tiles .model .json .json5 .toml .service .target .conf .md .html .css .js .svg"
+
+
+def wanted():
+    """Return the files of the source tree that belong into the wheel."""
+    common = REPOSITORY / "common"
+    files = {path.relative_to(common).as_posix() for path in (common / "sonarpost").rglob("*")}
+    files |= {f"sonarpost/{p.relative_to(REPOSITORY).as_posix()}" for p in (REPOSITORY / "services").rglob("*")}
+    files |= {f"sonarpost/cli/deployment/examples/{path.name}" for path in (REPOSITORY / "config").iterdir()}
+    return {name for name in files if name.endswith((*SUFFIXES.split(),)) and "__pycache__" not in name}
+
+
+def test_the_wheel_holds_what_runs_and_nothing_else(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    assert wanted() | {LEAFLET + name for name in ("leaflet.js", "leaflet.css", "LICENSE.md")} <= names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    folders = {name.partition("/")[0] for name in names}
+    assert [name.partition("-")[0] for name in sorted(folders)] == ["sonarpost", "sonarpost"]
+    assert [name for name in names if "__pycache__" in name] == []
 
 
 def closure(requirements):
