@@ -90,7 +90,6 @@ def test_derived_files_are_those_of_the_published_figures(tmp_path: Path, data_d
         "recognition.__main__ --sdvd {}",
         "detection.__main__ --sdvd {}",
         "codebook.shipped --humminbird {} --out {}/out",
-        "training.emb.evaluate --data {}",
         "training.emb.pool --data {} --out {}/pool.npz",
         "training.emb.sheets --data {} --out {} 22",
     ],

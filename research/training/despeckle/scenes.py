@@ -160,13 +160,6 @@ class Examples:
             noisy, clean = noisy.T, clean.T
         return noisy, clean, 1.0
 
-    def simulated(self, shape: tuple[int, int]) -> tuple[Floats, Floats]:
-        """Return a noisy and a clean image of a simulated scene, of a shape up to the scene's either way round."""
-        high = shape[0] > HEIGHT_PX
-        power, floor = self._scene(shape[::-1] if high else shape, simulated=True)
-        noisy, clean = self._observed(power, floor, product=bool(self._rng.random() < 0.6))
-        return (noisy.T, clean.T) if high else (noisy, clean)
-
     def _observed(self, power: Floats, floor: Floats, *, product: bool) -> tuple[Floats, Floats]:
         """Return noisy and clean grey images of a scene, 0..1."""
         rng = self._rng

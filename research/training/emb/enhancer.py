@@ -148,10 +148,9 @@ def main() -> None:  # noqa: PLR0915  a script
     sets = {}
     for name, part in (("train", slice(-args.images, None)), ("check", slice(100))):
         key = "tp80" if name == "train" else "vp80"
-        # A pool of despeckled images holds the scenes themselves as well.
-        source, truth = pool[key][part], pool[f"truth_{key}" if f"truth_{key}" in pool else key][part]
-        plane, mean, features = coded(codec, source, rng, args.streams if name == "train" else 2)
-        sets[name] = (truth.repeat(len(plane) // len(truth), 0), plane, mean, features)
+        images = pool[key][part]
+        plane, mean, features = coded(codec, images, rng, args.streams if name == "train" else 2)
+        sets[name] = (images.repeat(len(plane) // len(images), 0), plane, mean, features)
     print(f"coded, {time.time() - started_s:.0f} s", flush=True)
     params = resumed(codec.network) if args.resume else start(rng)
 

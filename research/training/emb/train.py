@@ -13,16 +13,113 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 import optax
 
-from research.training.emb.examples import Rows, blank_model, list_examples, measure_centres
-from sonarpost.codec.emb import contexts
-from sonarpost.codec.emb import kernel as k
+from sonarpost.codec.emb import contexts, kernel, range_coder, transform
+from sonarpost.codec.emb.bitplanes import START_THRESHOLDS, code_planes, extra_planes
+from sonarpost.codec.emb.coder import UNIT_SCALE, Coder, CoefficientState
 from sonarpost.codec.emb.model import FORMAT_2, FORMAT_3, Model, model_of, parse, read_arrays
+from sonarpost.codec.emb.rate_distortion_opt import TargetCoefficients, target_coefficients
+from sonarpost.codec.emb.side_info import MEAN_STEP, SideInfo, region_weights
+from sonarpost.codec.emb.transform import layout_of
 
 SEED = 7
 BATCH = 8192
 Params = dict[str, jax.Array]
+Rows = npt.NDArray[np.int16]
+
+MIN_BYTES, MAX_BYTES = 18, 620
+"""Length of a stream for 80 x 80 px; proportional to the number of pixels for larger images."""
+
+
+def blank_model() -> Model:
+    """Return a model without context networks; only the reconstruction points are set."""
+    zeros = {name: np.zeros(shape, np.int32) for name, shape, _ in FORMAT_2.arrays}
+    zeros["centres"][:] = np.array([104, 110, 118, 124])[:, None]
+    return model_of(zeros)
+
+
+def random_side_info(targets: npt.NDArray[np.int32], mean_index: int, rng: np.random.Generator) -> SideInfo:
+    """Return side information with a random start step."""
+    step = int(rng.integers(8))
+    return SideInfo(mean_index, step, None, None, extra_planes(targets, step))
+
+
+def random_target(
+    model: Model, image: npt.NDArray[np.uint8], rng: np.random.Generator
+) -> tuple[TargetCoefficients, int, int]:
+    """Return target coefficients for a random number of bytes, the index of the mean level, and the bytes."""
+    layout = layout_of(*image.shape)
+    size = int(np.exp(rng.uniform(np.log(MIN_BYTES), np.log(MAX_BYTES))) * image.size / 6400)
+    mean_index = min((int(image.astype(np.int64).sum()) // image.size + MEAN_STEP // 2) // MEAN_STEP, 63)
+    plane = (image.astype(np.int64) - mean_index * MEAN_STEP) * transform.UNIT
+    return target_coefficients(plane, layout, region_weights(layout, None), size, model.perceptual), mean_index, size
+
+
+def list_examples(
+    model: Model, images: npt.NDArray[np.uint8], rng: np.random.Generator, rows_per_image: int
+) -> tuple[Rows, Rows]:
+    """Return decisions (contexts, bit, net, share, weight) and signs (contexts, orientation, sign).
+
+    Each image is listed at a random start step, with the target coefficients of a random number of bytes, down to the
+    bit plane that those bytes reach. The model determines in which pass a coefficient is coded. The weight gives every
+    stream the same influence.
+    """
+    decisions, signs = [], []
+    rows = np.zeros((rows_per_image, contexts.FEATURES + 3), np.int16)
+    sign_rows = np.zeros((rows_per_image // 8, contexts.SIGN_FEATURES + 2), np.int16)
+    for image in images:
+        target, mean_index, size = random_target(model, image, rng)
+        side = random_side_info(target.targets, mean_index, rng)
+        writer, state = Coder.writer(size), CoefficientState(target.layout)
+        code_planes(writer, state, model, target.targets, side)
+        planes = (
+            round(np.log2((START_THRESHOLDS[side.start_step] << side.extra_planes) / state.threshold))
+            + 1
+            - side.extra_planes
+        )
+        coder = Coder(range_coder.COLLECT, np.zeros(0, np.uint8))
+        coder.decisions, coder.sign_decisions = rows, sign_rows
+        coder.words[range_coder.CODER_CODE] = int(rng.integers(1 << 30))
+        code_planes(coder, CoefficientState(target.layout), model, target.targets, side, planes=planes)
+        used, used_signs = (int(coder.words[word]) for word in (range_coder.CODER_ROWS, range_coder.CODER_SIGN_ROWS))
+        weight = np.full((used, 1), min(12500 // size, 32000), np.int16)
+        decisions.append(np.concatenate([rows[:used], weight], axis=1))
+        signs.append(sign_rows[:used_signs].copy())
+    return np.concatenate(decisions), np.concatenate(signs)
+
+
+def measure_centres(model: Model, images: npt.NDArray[np.uint8], rng: np.random.Generator) -> npt.NDArray[np.float64]:
+    """Return the mean reconstruction points, in 1/256 of the interval, by size and logit; see `kernel._reconstruct`.
+
+    Each image is coded with random start step and length. Cells of the table with few coefficients are set by a
+    straight line through the others.
+    """
+    total = np.zeros((4, kernel.CENTRE_COLUMNS, 2))
+    for image in images:
+        target, mean_index, size = random_target(model, image, rng)
+        coder, state = Coder.writer(size), CoefficientState(target.layout)
+        code_planes(coder, state, model, target.targets, random_side_info(target.targets, mean_index, rng))
+        significant = state.lower > 0
+        value, width = state.lower[significant], state.widths[significant]
+        part = (np.abs(target.targets[significant]) * (state.scale[significant] / UNIT_SCALE) - value) / width
+        row, column = (
+            np.minimum(value // width, 4) - 1,
+            np.clip((state.logits[significant] + 2304) >> 7, 0, kernel.CENTRE_COLUMNS - 1),
+        )
+        inside = (part >= 0) & (part < 1)
+        np.add.at(total, (row[inside], column[inside], 0), part[inside])
+        np.add.at(total, (row[inside], column[inside], 1), 1)
+    out = np.zeros((4, kernel.CENTRE_COLUMNS))
+    columns = np.arange(kernel.CENTRE_COLUMNS)
+    for row in range(4):
+        enough = total[row, :, 1] > 60
+        mean = total[row, enough, 0] / total[row, enough, 1]
+        line = np.polyfit(columns[enough], mean, 1, w=np.sqrt(total[row, enough, 1]))
+        out[row] = np.clip(np.polyval(line, columns), 0.12, 0.52)
+        out[row, enough] = mean
+    return np.rint(256 * out)
 
 
 def layer(x: jax.Array) -> jax.Array:
@@ -44,8 +141,8 @@ def sign_network(p: Params, x: jax.Array) -> jax.Array:
 
 def start(rng: np.random.Generator, features: int) -> Params:
     """Return initial weights (He initialisation)."""
-    shapes = ((features, k.HIDDEN_1), (k.HIDDEN_1, k.HIDDEN_2), (k.HIDDEN_2,))
-    out: Params = {"b1": jnp.zeros(k.HIDDEN_1), "b2": jnp.zeros(k.HIDDEN_2), "b3": jnp.zeros(())}
+    shapes = ((features, kernel.HIDDEN_1), (kernel.HIDDEN_1, kernel.HIDDEN_2), (kernel.HIDDEN_2,))
+    out: Params = {"b1": jnp.zeros(kernel.HIDDEN_1), "b2": jnp.zeros(kernel.HIDDEN_2), "b3": jnp.zeros(())}
     for i, shape in enumerate(shapes):
         scale = (1.0 if i else 0.5) * np.sqrt(2 / shape[0])
         out[f"w{i + 1}"] = jnp.asarray(rng.normal(0, scale, shape) * (0.3 if i == 2 else 1))
@@ -104,7 +201,7 @@ def integers(nets: list[Params], signs: list[Params]) -> dict[str, np.ndarray]:
 
 def tables() -> dict[str, np.ndarray]:
     """Return the tables of probabilities and costs."""
-    logit = np.arange(-k.LOGIT_LIMIT, k.LOGIT_LIMIT + 1) / 256
+    logit = np.arange(-kernel.LOGIT_LIMIT, kernel.LOGIT_LIMIT + 1) / 256
     chance = 1 / (1 + np.exp(-logit))
     whole = np.clip(np.rint(chance * 65536), 6, 65530)
     return {
@@ -165,9 +262,9 @@ def trained_signs(rows: Rows, steps: int, rng: np.random.Generator) -> list[Para
     for orient in range(4):
         oriented = rows[rows[:, f] == orient]
         first = {
-            "w1": jnp.asarray(rng.normal(0, 0.15, (f, k.SIGN_HIDDEN))),
-            "b1": jnp.zeros(k.SIGN_HIDDEN) + 0.2,
-            "w2": jnp.asarray(rng.normal(0, 0.1, k.SIGN_HIDDEN)),
+            "w1": jnp.asarray(rng.normal(0, 0.15, (f, kernel.SIGN_HIDDEN))),
+            "b1": jnp.zeros(kernel.SIGN_HIDDEN) + 0.2,
+            "w2": jnp.asarray(rng.normal(0, 0.1, kernel.SIGN_HIDDEN)),
         }
         even = np.ones(len(oriented), np.float32)
         bits = oriented[:, f + 1].astype(np.float32)
