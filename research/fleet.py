@@ -42,7 +42,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -340,17 +340,22 @@ def open_session(endpoint: str) -> zenoh.Session:
             time.sleep(0.2)
 
 
-def wait_until_ready(session: zenoh.Session, vessels: Sequence[str]) -> None:
-    """Wait until the shore site reaches c2 and every relay."""
-    expected = {keys.alive("shore-1", "c2"), *(keys.alive(vessel, "relay") for vessel in vessels)}
-    deadline = time.monotonic() + 60
+def wait_until_alive(session: zenoh.Session, expected: Set[str], timeout_s: float) -> None:
+    """Wait until a session receives the liveliness tokens of these keys; exit after the time-out."""
+    deadline_s = time.monotonic() + timeout_s
     alive: set[str] = set()
     while not expected <= alive:
-        if time.monotonic() > deadline:
-            sys.exit(f"fleet: not started: {sorted(expected - alive)}")
+        if time.monotonic() > deadline_s:
+            sys.exit(f"not started: {sorted(expected - alive)}")
         time.sleep(0.2)
         replies = session.liveliness().get(keys.alive_everywhere(), timeout=2.0)
         alive = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+
+
+def wait_until_ready(session: zenoh.Session, vessels: Sequence[str]) -> None:
+    """Wait until the shore site reaches c2 and every relay."""
+    expected = {keys.alive("shore-1", "c2"), *(keys.alive(vessel, "relay") for vessel in vessels)}
+    wait_until_alive(session, expected, 60.0)
 
 
 def run(folder: Path, vehicles: int, vessels: int, seconds: float, every_s: float) -> dict[str, object]:

@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from research.common.link_emulator import LinkEmulator
 from research.common.ports import free_ports
-from research.fleet import open_session
+from research.fleet import open_session, wait_until_alive
 from research.relay_throughput import VESSEL, Sink, decision, platform
 from sonarpost import keys, wire
 from sonarpost.bus.session import router_config
@@ -201,9 +201,7 @@ def vessel(link: Link, images: Sequence[CodedImage], sites: Sequence[str] = (key
             stack.callback(one.cut)  # a router does not close while data waits for a stalled link
         relay.queue(keys.image_coded(VESSEL), *map(wire.encode, images))
         with open_session(endpoint) as session:
-            for site in sites:
-                while not any(reply.ok for reply in session.liveliness().get(keys.alive(f"{site}-c2", "c2"))):
-                    time.sleep(POLL_S)
+            wait_until_alive(session, {keys.alive(f"{site}-c2", "c2") for site in sites}, 60.0)
         yield Vessel(relay, links, sinks[0], again)
 
 

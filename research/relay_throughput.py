@@ -126,12 +126,12 @@ def platform(name: str, endpoint: str, folder: Path) -> PlatformConfig:
 
 
 def decision(number: int) -> Decision:
-    """Return a decision of about 200 bytes."""
+    """Return a decision of about 200 bytes about an image of its own."""
     return Decision(
         decision_id=f"d-{number}",
         vessel_id=VESSEL,
         vehicle_id="uuv-1",
-        image_id="0001",
+        image_id=f"{number:04X}",
         image_version=1,
         verdict="unsure",
         operator="op",

@@ -28,30 +28,16 @@ import msgpack
 import zenoh
 
 from research.fleet import Processes, coded_image, fleet, open_session, percentiles, wait_until_ready
+from research.relay_throughput import VESSEL, decision
 from sonarpost import keys
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.delivery.client import deliver
 from sonarpost.messages import CodedImage, Decision
 
-VESSEL = "vessel-1"
 WARM_UP = 20
 """Records before the measurement, in which files and queues are created."""
 TIMEOUT_S = 30.0
 SERVICES = ("relay", "c2", f"router-{VESSEL}", "router-shore")
-
-
-def new_decision(number: int) -> Decision:
-    """Return a decision about an image of its own."""
-    return Decision(
-        decision_id=f"d-{number}",
-        vessel_id=VESSEL,
-        vehicle_id="uuv-1",
-        image_id=f"{number:04X}",
-        image_version=1,
-        verdict="unsure",
-        operator="op",
-        decided_utc_s=time.time(),
-    )
 
 
 def new_image(number: int) -> CodedImage:
@@ -100,7 +86,7 @@ def used_since(processes: Processes, before: dict[str, float], divisor: float) -
 
 def measure(folder: Path, records: int, rate_per_s: float, kind: str) -> dict[str, object]:
     """Hand over records; return the figures."""
-    make: Callable[[int], CodedImage | Decision] = new_image if kind == "image" else new_decision
+    make: Callable[[int], CodedImage | Decision] = new_image if kind == "image" else decision
     key = keys.image_coded(VESSEL) if kind == "image" else keys.contact_decision(VESSEL)
     name = "image_id" if kind == "image" else "decision_id"
     arrivals = Arrivals(make(0).TYPE, name)

@@ -21,7 +21,7 @@ import random
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -32,14 +32,15 @@ from typing_extensions import override
 
 from research.common.link_emulator import LinkEmulator
 from research.common.ports import free_ports
-from research.fleet import Processes, coded_image, open_session
+from research.fleet import Processes, coded_image, open_session, wait_until_alive
+from research.relay_throughput import Sink
 from sonarpost import keys
 from sonarpost.bus import router
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.config import PlatformConfig, ServiceConfig
 from sonarpost.delivery.client import deliver
-from sonarpost.messages import ImagePart, Record, Relayed
-from sonarpost.runtime.service import Service, UnitOfWork
+from sonarpost.messages import ImagePart, Record
+from sonarpost.runtime.service import UnitOfWork
 from sonarpost.security.fleet import Fleet
 from sonarpost.security.router_config import RouterOptions, router_json5
 from sonarpost.services.relay.config import RelayConfig
@@ -94,19 +95,12 @@ class HealthTimes:
         return max(later - earlier for found in times for earlier, later in pairwise(found))
 
 
-class Shore(Service[ServiceConfig]):
+class Shore(Sink):
     """A c2 that commits and counts images: its decoder would use the cores of the measurement."""
-
-    NAME = "c2"
 
     def __init__(self, platform: PlatformConfig, config: ServiceConfig) -> None:
         super().__init__(platform, config)
         self.images: set[str] = set()
-
-    @override
-    def consumed_keys(self) -> Mapping[str, type[Record]]:
-        """Return the records of the relay."""
-        return {keys.shore_inbox_all(): Relayed, keys.shore_part_all(): ImagePart}
 
     @override
     def handle(self, key: str, record: Record, effects: UnitOfWork) -> None:
@@ -179,21 +173,8 @@ def linked_sites(folder: Path, setting: Setting) -> Iterator[Sites]:
             one.start()
             stack.callback(one.stop)
         vessel, shore = (stack.enter_context(open_session(ends[name])) for name in (VESSEL, SHORE))
-        wait_until_started(shore)
+        wait_until_alive(shore, {keys.alive(VESSEL, name) for name in SERVICES}, START_TIMEOUT_S)
         yield Sites(link, c2, relay, vessel, shore)
-
-
-def wait_until_started(shore: zenoh.Session) -> None:
-    """Wait until the shore's router has the tokens of all services."""
-    expected = {keys.alive(VESSEL, name) for name in SERVICES}
-    deadline_s = time.monotonic() + START_TIMEOUT_S
-    alive: set[str] = set()
-    while not expected <= alive:
-        if time.monotonic() > deadline_s:
-            sys.exit(f"thin_link: not started: {sorted(expected - alive)}")
-        time.sleep(0.5)
-        replies = shore.liveliness().get(keys.alive_everywhere(), timeout=2.0)
-        alive = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
 
 def measure(folder: Path, setting: Setting, images: int, seconds: float) -> bool:
