@@ -29,7 +29,6 @@ def emulate():
         modems = [{"address": number + 1, "east_m": 300.0 * number} for number in range(count)]
         values = {"modem": modems, "tcp_ports": (0,) * count, "time_scale": 20.0, **settings}
         emulator = ChannelEmulator(EmulatorConfig.model_validate(values))
-        emulator.open()
         emulator.start()
         started.append(emulator)
         return [device.device for device in emulator.devices()]

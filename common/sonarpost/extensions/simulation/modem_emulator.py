@@ -70,7 +70,6 @@ def run(parsed: argparse.Namespace) -> int:
 
 def _serve(parsed: argparse.Namespace, stop: threading.Event) -> int:
     emulator = ChannelEmulator(_config(parsed), echo=sys.stdout if parsed.json else None)
-    emulator.open()
     try:
         devices = emulator.devices()
         listed = [{"address": device.address, "device": device.device} for device in devices]

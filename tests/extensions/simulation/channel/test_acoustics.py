@@ -15,9 +15,8 @@ def test_absorption_matches_the_tables(frequency_hz: float, db_per_km: float):
     assert absorption_db_per_km(frequency_hz) == pytest.approx(db_per_km, rel=0.12)
 
 
-def test_absorption_decreases_with_salinity_and_depth():
+def test_absorption_decreases_with_salinity():
     assert absorption_db_per_km(25_000, salinity_psu=0.0) < 0.4
-    assert absorption_db_per_km(25_000, depth_m=5000.0) < 0.6 * absorption_db_per_km(25_000)
 
 
 def test_noise_matches_the_wenz_curves():

@@ -56,15 +56,6 @@ def test_arrival_follows_travel_time_and_air_time():
     assert channel.in_flight == 0
 
 
-def test_moved_modem_changes_the_travel_time_of_later_packets():
-    channel = make_channel(0.0, 140.0, sound_speed_m_per_s=1400.0)
-    channel.transmit(1, packet(b"a"), now=0.0)
-    channel.move(2, LocalPosition(280.0))
-    assert ended(channel.poll(100.0))[0].delay_s == pytest.approx(0.1)
-    channel.transmit(1, packet(b"a"), now=100.0)
-    assert ended(channel.poll(200.0))[0].delay_s == pytest.approx(0.2)
-
-
 @pytest.mark.parametrize("start_s", [-2.9, 0.0, 2.9])
 def test_half_duplex(start_s: float):
     channel = make_channel(0.0, 0.0)

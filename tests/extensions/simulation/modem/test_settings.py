@@ -1,6 +1,5 @@
 """Settings, clock, revision and reboots of the emulated modem."""
 
-import pytest
 from builders.emulator_bench import START_UTC_S, EmulatorBench
 
 from sonarpost.extensions.simulation.modem.emulator import EmulatedMicroModem
@@ -152,9 +151,3 @@ def test_number_of_settings_is_bounded():
     for number in range(2000):
         modem.receive(nmea.format("CCCFG", f"name.{number}", 1), 0.0)
     assert len(modem.settings.items()) == 512
-
-
-@pytest.mark.parametrize("config", [{"generation": 3}, {"airtimes_s": {1: 0.0}}, {"airtimes_s": {9: 1.0}}])
-def test_invalid_configuration_names_the_field(config: dict[str, object]):
-    with pytest.raises(ValueError, match=next(iter(config))):
-        EmulatedModemConfig(1, **config)  # type: ignore[arg-type]

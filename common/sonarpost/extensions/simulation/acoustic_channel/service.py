@@ -32,8 +32,8 @@ class AcousticChannelService(Service[AcousticChannelConfig]):
 
     def __init__(self, platform: PlatformConfig, config: AcousticChannelConfig) -> None:
         super().__init__(platform, config)
-        self._emulator = ChannelEmulator(config)
         try:
+            self._emulator = ChannelEmulator(config)
             self._emulator.start()
         except BaseException:
             self.store.close()

@@ -34,30 +34,24 @@ class LocalPosition:
     north_m: float = 0.0
     depth_m: float = 0.0
 
-    def __post_init__(self) -> None:
-        if not all(math.isfinite(value) for value in (self.east_m, self.north_m, self.depth_m)):
-            raise ValueError(f"position: got {self!r}, expected finite metres")
-
     def range_m(self, other: LocalPosition) -> float:
         """Return the straight distance to `other` in metres."""
         return math.dist((self.east_m, self.north_m, self.depth_m), (other.east_m, other.north_m, other.depth_m))
 
 
-def absorption_db_per_km(
-    frequency_hz: float, temperature_c: float = 10.0, salinity_psu: float = 35.0, depth_m: float = 0.0, ph: float = 8.0
-) -> float:
-    """Return the absorption of sound in sea water, dB/km.
+def absorption_db_per_km(frequency_hz: float, temperature_c: float = 10.0, salinity_psu: float = 35.0) -> float:
+    """Return the absorption of sound in sea water near the surface, at pH 8, dB/km.
 
     Source: Ainslie and McColm, "A simplified formula for viscous and chemical absorption in sea water", JASA 103
     (1998). It sums boric acid, magnesium sulphate and pure water, within 10 % of Francois and Garrison (1982) from
     100 Hz to 1 MHz.
     """
-    f, z, t = frequency_hz / 1000.0, depth_m / 1000.0, temperature_c
+    f, t = frequency_hz / 1000.0, temperature_c
     f1 = 0.78 * math.sqrt(salinity_psu / 35.0) * math.exp(t / 26.0)
     f2 = 42.0 * math.exp(t / 17.0)
-    boric_acid = 0.106 * f1 * f**2 / (f**2 + f1**2) * math.exp((ph - 8.0) / 0.56)
-    magnesium = 0.52 * (1.0 + t / 43.0) * (salinity_psu / 35.0) * f2 * f**2 / (f**2 + f2**2) * math.exp(-z / 6.0)
-    return boric_acid + magnesium + 0.00049 * f**2 * math.exp(-(t / 27.0 + z / 17.0))
+    boric_acid = 0.106 * f1 * f**2 / (f**2 + f1**2)
+    magnesium = 0.52 * (1.0 + t / 43.0) * (salinity_psu / 35.0) * f2 * f**2 / (f**2 + f2**2)
+    return boric_acid + magnesium + 0.00049 * f**2 * math.exp(-t / 27.0)
 
 
 def noise_db_per_hz(frequency_hz: float, wind_m_per_s: float = 5.0, shipping: float = 0.5) -> float:
@@ -77,9 +71,7 @@ def noise_db_per_hz(frequency_hz: float, wind_m_per_s: float = 5.0, shipping: fl
     return 10.0 * math.log10(sum(10.0 ** (level_db / 10.0) for level_db in sources_db))
 
 
-def transmission_loss_db(
-    range_m: float, absorption_db_per_km: float, spreading_db_per_decade: float = SPHERICAL_DB_PER_DECADE
-) -> float:
+def transmission_loss_db(range_m: float, absorption_db_per_km: float, spreading_db_per_decade: float) -> float:
     """Return the loss from 1 m to `range_m`, dB; ranges below 1 m count as 1 m.
 
     Source: TL = k log10(r) + a r (Urick, "Principles of underwater sound"), k being 20 for spherical, 15 for practical

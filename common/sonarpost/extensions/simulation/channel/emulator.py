@@ -14,11 +14,9 @@ import threading
 import time
 from collections import deque
 from dataclasses import asdict, dataclass, field
-from enum import Enum
 from typing import IO
 
 from sonarpost.errors import PortError
-from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.config import EmulatorConfig
 from sonarpost.extensions.simulation.channel.host_ports import HostPort, PtyPort, TcpPort
 from sonarpost.extensions.simulation.channel.packet_log import PacketLog, PacketTotals
@@ -54,63 +52,40 @@ class _HostLine:
     written_of_first: int = 0
 
 
-class _State(Enum):
-    NEW = "new"
-    OPEN = "open"
-    RUNNING = "running"
-    CLOSED = "closed"
-
-
 class ChannelEmulator:
     """Emulated modems on pseudo-terminals or TCP ports, with the channel between them.
 
-    `echo` is a second output for every line of the log.
+    Its ports and its log are open from the beginning: hosts can connect, and get no answer before `start`.
+
+    Args:
+        config: Its configuration.
+        echo: A second output for every line of the log.
+
+    Raises:
+        PortError: A port or the log cannot be opened; everything is closed again.
     """
 
     def __init__(self, config: EmulatorConfig, echo: IO[str] | None = None) -> None:
         self.config = config
-        self._echo = echo
         self._lock = threading.Lock()
-        self._state = _State.NEW
         self._stopping = threading.Event()
         self._lines: dict[int, _HostLine] = {}
-        self._log = PacketLog(None)
-        self._thread: threading.Thread
+        self._thread: threading.Thread | None = None
         self._simulator: ChannelSimulator
         self._started_s = 0.0  # reading of the monotonic clock at simulated time zero
         self._wake_out = self._wake_in = -1
         self.failure: Exception | None = None
         """The error that ended the emulator; None while it runs and after `stop`."""
-
-    def open(self) -> None:
-        """Open the ports and the log: hosts can connect, and get no answer yet.
-
-        Raises:
-            PortError: A port or the log cannot be opened; everything is closed again.
-            RuntimeError: It was opened before.
-        """
-        if self._state is not _State.NEW:
-            raise RuntimeError("a ChannelEmulator can be opened only once")
-        self._state = _State.OPEN
+        self._log = PacketLog(config.log, echo)
         try:
-            self._log = PacketLog(self.config.log, self._echo)
-            for number in range(1, len(self.config.modem) + 1):
+            for number in range(1, len(config.modem) + 1):
                 self._lines[number] = _HostLine(self._open_port(number))
         except PortError:
-            self._state = _State.CLOSED
             self._close()
             raise
 
     def start(self) -> None:
-        """Start the thread, after `open` if that was not called.
-
-        Raises:
-            PortError: A port or the log cannot be opened.
-            RuntimeError: It was started before.
-        """
-        if self._state is not _State.OPEN:
-            self.open()
-        self._state = _State.RUNNING
+        """Start the thread, once."""
         self._simulator = self._make_simulator()
         self._started_s = time.monotonic()
         self._wake_out, self._wake_in = os.pipe()
@@ -118,16 +93,17 @@ class ChannelEmulator:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop, write the totals and close everything; without effect on an emulator that is not open."""
-        state, self._state = self._state, _State.CLOSED
-        if state is _State.OPEN:
+        """Stop, write the totals and close everything; without effect if it is stopped already."""
+        if self._stopping.is_set():
+            return
+        self._stopping.set()
+        if self._thread is None:
             self._close()
-        elif state is _State.RUNNING:
-            self._stopping.set()
-            os.write(self._wake_in, b"x")
-            self._thread.join()
-            os.close(self._wake_in)
-            os.close(self._wake_out)
+            return
+        os.write(self._wake_in, b"x")
+        self._thread.join()
+        os.close(self._wake_in)
+        os.close(self._wake_out)
 
     def devices(self) -> list[Device]:
         """Return the device of every modem, by modem number."""
@@ -143,12 +119,6 @@ class ChannelEmulator:
         """Return the number of modems with a connected host."""
         with self._lock:
             return sum(line.port.connected for line in self._lines.values())
-
-    def move(self, modem: int, position: LocalPosition) -> None:
-        """Set a modem's position."""
-        with self._lock:
-            self._simulator.channel.move(modem, position)
-            self._write("move", modem=modem, position_m=asdict(position))
 
     def _open_port(self, number: int) -> HostPort:
         if self.config.tcp_ports:

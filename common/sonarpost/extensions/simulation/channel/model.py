@@ -153,10 +153,6 @@ class ChannelModel:
         """Number of arrivals that have not ended."""
         return sum(not arrival.resolved for modem in self._modems.values() for arrival in modem.arrivals)
 
-    def move(self, modem: int, position: LocalPosition) -> None:
-        """Set a modem's position; packets in flight keep their travel time."""
-        self._modems[modem].position = position
-
     def travel_times_s(self, modem: int, places: Mapping[str, LocalPosition]) -> dict[str, float]:
         """Return the one-way travel time, in seconds, from a modem to named places."""
         own = self._modems[modem].position

@@ -3,7 +3,7 @@
 Values of `event`:
 
 - `start`: settings, and position and device of every modem.
-- `client`: a host opened or closed a modem's port. `move`: a modem's position changed.
+- `client`: a host opened or closed a modem's port.
 - `packet`: outcome of one packet at one receiver, with every frame. The line is written when the packet's sentences
   have been written to the receiver's port (`heard` is true), or when it is certain that they will not be (`heard` is
   false, and `not_heard_because` holds the reason). The outcome of a frame is the channel's; `heard` is the host's side.

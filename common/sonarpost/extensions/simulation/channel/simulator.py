@@ -32,14 +32,9 @@ class SerialLine(Generic[T]):
 
     Args:
         baud: Bits a second, above zero, or None for a line without delay.
-
-    Raises:
-        ValueError: A speed that is not above zero.
     """
 
     def __init__(self, baud: float | None) -> None:
-        if baud is not None and not baud > 0:
-            raise ValueError(f"baud: got {baud!r}, expected bits a second above 0, or None")
         self._baud = baud
         self._items: deque[tuple[float, T]] = deque()
         self._free_s = 0.0

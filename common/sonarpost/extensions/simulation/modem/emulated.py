@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import ClassVar, Final, Protocol
+from typing import ClassVar, Final
 
 from typing_extensions import override
 
 from sonarpost.errors import SentenceError
-from sonarpost.extensions.simulation.channel.events import AcousticPacket, ArrivalEnded, ArrivalStarted, PacketKind
+from sonarpost.extensions.simulation.channel.events import AcousticPacket, ArrivalEnded, PacketKind
 from sonarpost.extensions.simulation.modem.emulator import EmulatedMicroModem
 from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings, airtime_of, good_frames
-from sonarpost.extensions.simulation.modem.receiver import HostOutput, PacketReport
 from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 from sonarpost.extensions.simulation.modem.transmitter import TravelTimes
 from sonarpost.modem.udp.datagram import Datagram, DatagramAssembler, DatagramKind
@@ -21,38 +20,7 @@ from sonarpost.registry import Registry
 DEFAULT_MODEM: Final = "micromodem"
 
 EmulatorSettings = EmulatedModemConfig | PacketModemSettings
-
-
-class EmulatedModem(Protocol):
-    """What the channel simulator needs of a modem; see `EmulatedMicroModem`."""
-
-    @property
-    def address(self) -> int:
-        """The modem's address."""
-
-    def receive(self, data: bytes, now: float) -> None:
-        """Process bytes from the host."""
-
-    def poll(self, now: float) -> None:
-        """Do what is due at `now`."""
-
-    def next_deadline_s(self) -> float:
-        """Return the simulated time at which `poll` has something to do."""
-
-    def arrival_started(self, arrival: ArrivalStarted) -> None:
-        """Process the start of a packet at this modem."""
-
-    def arrival_ended(self, arrival: ArrivalEnded) -> PacketReport:
-        """Process the end of a packet at this modem."""
-
-    def packets_to_transmit(self) -> list[AcousticPacket]:
-        """Remove and return the packets whose transmission starts now."""
-
-    def take_outputs(self) -> list[HostOutput]:
-        """Remove and return the bytes for the host."""
-
-    def host_disconnected(self) -> None:
-        """Drop the unfinished input of a host that has disconnected."""
+EmulatedModem = EmulatedMicroModem | PacketModem
 
 
 @cache
