@@ -130,7 +130,7 @@ def test_live_service_counts_what_the_server_has_received(authority, tmp_path):
     assert server.received == []
     server.close()
     server = TakServer(port=port)
-    service = CotService(CotSender(f"tcp://127.0.0.1:{port}", settle_s=0.0), None, clock=clock, utc=clock)
+    service = CotService(CotSender(f"tcp://127.0.0.1:{port}", TlsFiles(), settle_s=0.0), None, clock=clock, utc=clock)
     assert service.send_due() == 0
     service.add(ContactChange(live.add(image("0003")), None))
     assert service.send_due() == 1

@@ -40,7 +40,7 @@ def authority(tmp_path):
     return Authority(tmp_path)
 
 
-def sender_to(server, scheme="tcp", tls=None, **options):
+def sender_to(server, scheme="tcp", tls=TlsFiles(), **options):  # noqa: B008 it is frozen
     return CotSender(f"{scheme}://127.0.0.1:{server.port}", tls, **{"settle_s": 0.0, "timeout_s": 600.0, **options})
 
 
@@ -108,9 +108,8 @@ def test_batch_is_sent_when_the_server_starts_later():
     def wait(_):
         if not started:
             started.append(TakServer(port=port))
-        return False
 
-    sender = CotSender(f"tcp://127.0.0.1:{port}", wait=wait, settle_s=0.0)
+    sender = CotSender(f"tcp://127.0.0.1:{port}", TlsFiles(), wait=wait, settle_s=0.0)
     sender.send(EVENTS)
     assert sender.delivered == started[0].events() == 2
     started[0].close()
@@ -122,9 +121,8 @@ def test_pauses_increase_until_the_time_limit():
     def wait(timeout):
         pauses.append(timeout)
         now[0] += timeout
-        return False
 
-    sender = CotSender(f"tcp://127.0.0.1:{port}", clock=lambda: now[0], wait=wait)
+    sender = CotSender(f"tcp://127.0.0.1:{port}", TlsFiles(), clock=lambda: now[0], wait=wait)
     with pytest.raises(PortError, match=rf"tcp://127.0.0.1:{port}: 0 of 2 events delivered: Connection refused$"):
         sender.send(EVENTS, give_up_after_s=20.0)
     assert pauses == [0.2, 0.5, 1.0, 2.0, 5.0, 5.0, 5.0]
@@ -227,7 +225,7 @@ def test_server_killed_in_mid_stream(serve, authority, version, reset_after):
 
 def test_interrupted_batch_is_sent_again(serve):
     server = serve(reset_in=0)
-    sender = sender_to(server, wait=lambda _: False)
+    sender = sender_to(server, wait=lambda _: None)
     assert sender.send(EVENTS) == READ
     assert sender.delivered == server.events() == 2
 
@@ -247,7 +245,7 @@ def test_server_that_closes_first_has_not_accepted_the_events(serve, authority, 
 def test_server_that_reads_nothing(serve):
     with socket.create_server(("127.0.0.1", 0)) as listener:  # it accepts no connection
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        sender = CotSender(f"tcp://127.0.0.1:{listener.getsockname()[1]}", timeout_s=0.01, settle_s=0.0)
+        sender = CotSender(f"tcp://127.0.0.1:{listener.getsockname()[1]}", TlsFiles(), timeout_s=0.01, settle_s=0.0)
         text = refused(sender, [b"x" * 60_000] * MAX_BATCH)
     assert "not acknowledged by the server's TCP within 0.01 s" in text
     assert sender.delivered == 0
@@ -271,7 +269,7 @@ def test_server_that_reads_a_few_bytes_a_while(monkeypatch):
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         thread = threading.Thread(target=read)
         thread.start()
-        sender = CotSender(f"tcp://127.0.0.1:{listener.getsockname()[1]}", timeout_s=WAIT_S, settle_s=0.0)
+        sender = CotSender(f"tcp://127.0.0.1:{listener.getsockname()[1]}", TlsFiles(), timeout_s=WAIT_S, settle_s=0.0)
         with pytest.raises(PortError, match="0 of 1 events delivered"):
             sender.send([bytes(20_000_000)], give_up_after_s=0.0)
         ended.set()
@@ -281,13 +279,13 @@ def test_server_that_reads_a_few_bytes_a_while(monkeypatch):
 def test_each_datagram_holds_one_event():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
-        sender = CotSender(f"udp://127.0.0.1:{receiver.getsockname()[1]}")
+        sender = CotSender(f"udp://127.0.0.1:{receiver.getsockname()[1]}", TlsFiles())
         assert sender.send(EVENTS) == DATAGRAMS
         assert [receiver.recv(65536) for _ in EVENTS] == list(EVENTS)
     assert sender.delivered == 2
     assert "Connection refused" in refused(sender, EVENTS[:1])
     with pytest.raises(PortError, match="65001 bytes"):
-        CotSender("udp://127.0.0.1:9").send([b"x" * 65_001])
+        CotSender("udp://127.0.0.1:9", TlsFiles()).send([b"x" * 65_001])
 
 
 # Files of TLS

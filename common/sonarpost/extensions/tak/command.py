@@ -22,7 +22,7 @@ from sonarpost.errors import ConfigError, PortError
 from sonarpost.export.contacts import ExportContact, load_contacts
 from sonarpost.export.live import MAX_NAMES
 from sonarpost.export.text import utc_text
-from sonarpost.extensions.tak.cot import CotOptions, cot_event, cot_events
+from sonarpost.extensions.tak.cot import cot_event, cot_events
 from sonarpost.extensions.tak.cot_sender import MAX_BATCH, CotSender
 from sonarpost.extensions.tak.data_package import (
     PackageRefusedError,
@@ -156,7 +156,6 @@ class CotService:
     Args:
         sender: Sender of events.
         files: HTTP interface of the TAK server; None sends events without images.
-        options: Options of the events.
         clock: Monotonic clock, seconds.
         utc: UTC clock, seconds.
         max_contacts: Above it the least recently changed contact of the vessel with the most is dropped.
@@ -166,7 +165,6 @@ class CotService:
         self,
         sender: CotSender,
         files: TakFiles | None,
-        options: CotOptions | None = None,
         *,
         clock: Callable[[], float] = time.monotonic,
         utc: Callable[[], float] = time.time,
@@ -174,7 +172,6 @@ class CotService:
     ) -> None:
         self._sender = sender
         self._files = files
-        self._options = options or CotOptions()
         self._clock = clock
         self._utc = utc
         self._max_contacts = max_contacts
@@ -275,7 +272,7 @@ class CotService:
         png = self._waiting.get(marker.contact.uid)
         if png is None or self._files is None or self._clock() < self._upload_retry_s:
             return
-        package = data_package(marker.contact, png, self._utc(), self._options)
+        package = data_package(marker.contact, png, self._utc())
         try:
             marker.package = self._files.upload(f"{file_name(marker.contact)}.zip", package, SENDER)
         except PortError as error:
@@ -288,7 +285,7 @@ class CotService:
 
     def _events(self, marker: _Marker) -> list[bytes]:
         now_utc_s = self._utc()
-        events = [cot_event(marker.contact, now_utc_s, self._options, marker.attachment)]
+        events = [cot_event(marker.contact, now_utc_s, marker.attachment)]
         if marker.package is not None and marker.transfers_left:
             events.append(file_transfer_event(marker.contact, marker.package, SENDER, now_utc_s))
         return events

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import IO, Final, Literal
+from typing import IO, Final
 from xml.etree import ElementTree as ET
 
 from sonarpost.export.contacts import ExportContact
@@ -21,7 +20,7 @@ from sonarpost.export.text import VERDICT_WORDS, class_text, probabilities_text,
 from sonarpost.review.decisions import ReviewState
 
 SPOT: Final = "b-m-p-s-m"
-SEA_MINE: Final = "U-W-M"
+SEA_MINE: Final = "a-s-U-W-M"
 BOTTOM_RETURN: Final = "a-u-U-N-B"
 MEASURED_IN_IMAGE: Final = "m-i"
 """CoT "machine, mensurated": the position was measured in imagery."""
@@ -29,6 +28,8 @@ UNAUTHENTICATED: Final = "Unauthenticated: any modem in range can have forged th
 """Remark about a contact whose acoustic frames were received without a key."""
 UNKNOWN: Final = "9999999.0"
 """CoT value of an unknown height or error."""
+STALE_AFTER_S: Final = 86400.0
+"""Lifetime of an event; it is long because contacts do not move."""
 
 # MIL-STD-2525B, subsurface, sea mine: G on the bottom, M moored, F floating. The class may end in " mine".
 MINE_POSITIONS: Final[Mapping[str, str]] = {
@@ -52,45 +53,53 @@ _TITLES: Final[Mapping[ReviewState, str]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class CotOptions:
-    """Options of the events.
-
-    Attributes:
-        stale_after_s: Lifetime of an event in seconds. The default is long because contacts do not move.
-        mine_affiliation: Affiliation of mine-like contacts: `u` unknown, `s` suspect, `h` hostile.
-
-    Raises:
-        ValueError: `stale_after_s` is not above 0.
-    """
-
-    stale_after_s: float = 86400.0
-    mine_affiliation: Literal["u", "s", "h"] = "s"
-
-    def __post_init__(self) -> None:
-        if not self.stale_after_s > 0:
-            raise ValueError(f"stale_after_s: got {self.stale_after_s}, expected above 0")
-
-
-def cot_type(contact: ExportContact, options: CotOptions | None = None) -> str:
+def cot_type(contact: ExportContact) -> str:
     """Return the event type: b-m-p-s-m, a-s-U-W-M (with -G, -M or -F for known mine classes) or a-u-U-N-B."""
     decision = contact.decision
     if decision is None or decision.verdict == "unsure":
         return SPOT
     if decision.verdict == "not_mine_like":
         return BOTTOM_RETURN
-    affiliation = (options or CotOptions()).mine_affiliation
     mlo_class = " ".join((decision.mlo_class or "").casefold().replace("_", " ").replace("-", " ").split())
     position = MINE_POSITIONS.get(mlo_class.removesuffix(" mine"))
-    return f"a-{affiliation}-{SEA_MINE}" + (f"-{position}" if position else "")
+    return SEA_MINE + (f"-{position}" if position else "")
 
 
-def cot_event(
-    contact: ExportContact,
-    now_utc_s: float,
-    options: CotOptions | None = None,
-    attachment_sha256: str | None = None,
-) -> bytes:
+def event_element(
+    contact: ExportContact, uid: str, kind: str, how: str, now_utc_s: float, stale_after_s: float, ce: str = UNKNOWN
+) -> ET.Element:
+    """Return an event at the position of a contact, which has one, without details.
+
+    Args:
+        contact: The contact.
+        uid: Identifier of the event.
+        kind: Its type.
+        how: How its position was found.
+        now_utc_s: Time of sending.
+        stale_after_s: Its lifetime in seconds.
+        ce: Error of the position in metres.
+    """
+    assert contact.position is not None
+    lat_deg, lon_deg = contact.position
+    event = ET.Element(
+        "event",
+        {
+            "version": "2.0",
+            "uid": uid,
+            "type": kind,
+            "time": utc_text(now_utc_s),
+            "start": utc_text(now_utc_s),
+            "stale": utc_text(now_utc_s + stale_after_s),
+            "how": how,
+        },
+    )
+    # The decimal type of the schema has no exponent.
+    lat, lon = f"{lat_deg:.{DEGREE_DECIMALS}f}", f"{lon_deg:.{DEGREE_DECIMALS}f}"
+    ET.SubElement(event, "point", {"lat": lat, "lon": lon, "hae": UNKNOWN, "ce": ce, "le": UNKNOWN})
+    return event
+
+
+def cot_event(contact: ExportContact, now_utc_s: float, attachment_sha256: str | None = None) -> bytes:
     """Return one event as a single line of XML, UTF-8, without XML declaration.
 
     `time` and `start` are the time of sending, because the clock of the vehicle may be wrong. The time of detection is
@@ -99,68 +108,34 @@ def cot_event(
     above the ellipsoid is unknown, because depth is measured from the surface.
 
     Args:
-        contact: The contact.
+        contact: The contact; it has a position.
         now_utc_s: Time of sending.
-        options: Options of the event.
         attachment_sha256: Digest of an attached file, hexadecimal, for `attachment_list`; None without one.
-
-    Raises:
-        ValueError: The contact has no position.
     """
-    options = options or CotOptions()
-    if contact.position is None:
-        raise ValueError(f"{contact.uid}: got no position, expected one")
-    lat_deg, lon_deg = contact.position
     record = contact.image.contact
     sigma_m = record.position_sigma_m if record else None
-    event = ET.Element(
-        "event",
-        {
-            "version": "2.0",
-            "uid": contact.uid,
-            "type": cot_type(contact, options),
-            "time": utc_text(now_utc_s),
-            "start": utc_text(now_utc_s),
-            "stale": utc_text(now_utc_s + options.stale_after_s),
-            "how": MEASURED_IN_IMAGE,
-        },
-    )
-    point = {
-        # The decimal type of the schema has no exponent.
-        "lat": f"{lat_deg:.{DEGREE_DECIMALS}f}",
-        "lon": f"{lon_deg:.{DEGREE_DECIMALS}f}",
-        "hae": UNKNOWN,
-        "ce": UNKNOWN if sigma_m is None else f"{sigma_m:.1f}",
-        "le": UNKNOWN,
-    }
-    ET.SubElement(event, "point", point)
-    _add_detail(event, contact)
+    ce = UNKNOWN if sigma_m is None else f"{sigma_m:.1f}"
+    event = event_element(contact, contact.uid, cot_type(contact), MEASURED_IN_IMAGE, now_utc_s, STALE_AFTER_S, ce)
+    detail = _add_detail(event, contact)
     if attachment_sha256 is not None:
-        detail = event.find("detail")
-        assert detail is not None
         ET.SubElement(detail, "attachment_list", {"hashes": f'["{attachment_sha256}"]'})
     xml: bytes = ET.tostring(event, encoding="utf-8")
     return xml
 
 
-def cot_events(
-    contacts: Iterable[ExportContact], now_utc_s: float, options: CotOptions | None = None
-) -> tuple[bytes, ...]:
+def cot_events(contacts: Iterable[ExportContact], now_utc_s: float) -> tuple[bytes, ...]:
     """Return the events of all contacts with a position. Contacts without a position are omitted."""
-    return tuple(cot_event(contact, now_utc_s, options) for contact in contacts if contact.position is not None)
+    return tuple(cot_event(contact, now_utc_s) for contact in contacts if contact.position is not None)
 
 
 def write_cot(file: IO[bytes], source: ExportSource) -> None:
     """Write the events of all contacts with a position within one `events` element, one event a line."""
     file.write(b'<?xml version="1.0" encoding="UTF-8"?>\n<events>\n')
-    now_utc_s = time.time()
-    for contact in source.contacts:
-        if contact.position is not None:
-            file.write(cot_event(contact, now_utc_s) + b"\n")
+    file.writelines(event + b"\n" for event in cot_events(source.contacts, time.time()))
     file.write(b"</events>\n")
 
 
-def _add_detail(event: ET.Element, contact: ExportContact) -> None:
+def _add_detail(event: ET.Element, contact: ExportContact) -> ET.Element:
     image, decision = contact.image, contact.decision
     detail = ET.SubElement(event, "detail")
     ET.SubElement(detail, "contact", {"callsign": contact.name})
@@ -183,6 +158,7 @@ def _add_detail(event: ET.Element, contact: ExportContact) -> None:
     ET.SubElement(detail, "sonarpost", {name: xml_text(value) for name, value in facts.items()})
     remarks = ET.SubElement(detail, "remarks", {"source": "sonarpost", "time": event.get("time", "")})
     remarks.text = xml_text(_remarks(contact))
+    return detail
 
 
 def _remarks(contact: ExportContact) -> str:

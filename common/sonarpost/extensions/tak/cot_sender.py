@@ -63,11 +63,6 @@ def parse_endpoint(text: str) -> TakEndpoint:
     return TakEndpoint(scheme, host, port)
 
 
-def _sleep(timeout_s: float) -> bool:
-    time.sleep(timeout_s)
-    return False
-
-
 class CotSender:
     """Sends batches of events.
 
@@ -80,7 +75,7 @@ class CotSender:
         timeout_s: Time limit of a connection attempt, and of each wait for progress.
         settle_s: Time between the acknowledgement of a batch by TCP and the end of its connection.
         clock: Monotonic clock, seconds.
-        wait: Waits between attempts, argument in seconds; returns True to stop trying. `threading.Event.wait` fits.
+        wait: Waits between attempts, argument in seconds.
 
     Raises:
         ConfigError: The endpoint or a file of `tls` is invalid.
@@ -89,16 +84,15 @@ class CotSender:
     def __init__(
         self,
         endpoint: str,
-        tls: TlsFiles | None = None,
+        tls: TlsFiles,
         *,
         timeout_s: float = 5.0,
         settle_s: float = SETTLE_S,
         clock: Callable[[], float] = time.monotonic,
-        wait: Callable[[float], bool] = _sleep,
+        wait: Callable[[float], object] = time.sleep,
     ) -> None:
         self.endpoint = parse_endpoint(endpoint)
         self.delivered = 0
-        tls = tls or TlsFiles()
         self._tls = tls.context() if self.endpoint.scheme == "tls" else None
         self._server_name = tls.server_name or self.endpoint.host
         self._timeout_s = timeout_s
@@ -134,10 +128,10 @@ class CotSender:
                 reasons[reason_of(error)] = None
                 pause_s = RETRY_S[min(attempt, len(RETRY_S) - 1)]
                 attempt += 1
-                is_over = isinstance(error, RefusedError) or self._clock() + pause_s - started_s > give_up_after_s
-                if is_over or self._wait(pause_s):
+                if isinstance(error, RefusedError) or self._clock() + pause_s - started_s > give_up_after_s:
                     counts = f"{begin} of {len(events)} events delivered"
                     raise PortError(f"{self.endpoint}: {counts}: {'; then '.join(reasons)}") from error
+                self._wait(pause_s)
             else:
                 begin += MAX_BATCH
                 self.delivered += len(batch)

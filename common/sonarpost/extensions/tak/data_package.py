@@ -21,8 +21,8 @@ from sonarpost.errors import ConfigError, PortError
 from sonarpost.export.contacts import ExportContact
 from sonarpost.export.formats import Format
 from sonarpost.export.source import ExportSource, archive_entry
-from sonarpost.export.text import utc_text, xml_text
-from sonarpost.extensions.tak.cot import UNKNOWN, CotOptions, cot_event
+from sonarpost.export.text import xml_text
+from sonarpost.extensions.tak.cot import cot_event, event_element
 from sonarpost.network import http_client
 from sonarpost.security.client_tls import TlsFiles
 
@@ -38,18 +38,14 @@ def write_data_package(file: IO[bytes], source: ExportSource) -> None:
     """Write a data package of all contacts with a position, named after the file."""
     pairs = ((contact, source.images.png(contact)) for contact in source.contacts if contact.position is not None)
     with zipfile.ZipFile(file, "w") as archive:
-        _fill(archive, source.path.name.partition(".")[0], pairs, time.time(), None)
+        _fill(archive, source.path.name.partition(".")[0], pairs, time.time())
 
 
-def data_package(contact: ExportContact, png: bytes, now_utc_s: float, options: CotOptions | None = None) -> bytes:
-    """Return a data package of one contact with its image.
-
-    Raises:
-        ValueError: The contact has no position.
-    """
+def data_package(contact: ExportContact, png: bytes, now_utc_s: float) -> bytes:
+    """Return a data package of one contact, which has a position, with its image."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        _fill(archive, contact.name, [(contact, png)], now_utc_s, options)
+        _fill(archive, contact.name, [(contact, png)], now_utc_s)
     return buffer.getvalue()
 
 
@@ -75,27 +71,9 @@ def file_transfer_event(contact: ExportContact, package: UploadedPackage, sender
         package: The package.
         sender: Name of the sender on the clients.
         now_utc_s: Time of sending; the event is valid for 10 minutes.
-
-    Raises:
-        ValueError: The contact has no position.
     """
-    if contact.position is None:
-        raise ValueError(f"{contact.uid}: got no position, expected one")
-    event = ET.Element(
-        "event",
-        {
-            "version": "2.0",
-            "uid": str(uuid.uuid5(_NAMESPACE, package.sha256)),
-            "type": FILE_TRANSFER,
-            "time": utc_text(now_utc_s),
-            "start": utc_text(now_utc_s),
-            "stale": utc_text(now_utc_s + 600.0),
-            "how": _HUMAN,
-        },
-    )
-    lat_deg, lon_deg = contact.position
-    point = {"lat": f"{lat_deg:.7f}", "lon": f"{lon_deg:.7f}", "hae": UNKNOWN, "ce": UNKNOWN, "le": UNKNOWN}
-    ET.SubElement(event, "point", point)
+    uid = str(uuid.uuid5(_NAMESPACE, package.sha256))
+    event = event_element(contact, uid, FILE_TRANSFER, _HUMAN, now_utc_s, 600.0)
     detail = ET.SubElement(event, "detail")
     ET.SubElement(
         detail,
@@ -120,11 +98,7 @@ def file_name(contact: ExportContact) -> str:
 
 
 def _fill(
-    archive: zipfile.ZipFile,
-    name: str,
-    contacts: Iterable[tuple[ExportContact, bytes | None]],
-    now_utc_s: float,
-    options: CotOptions | None,
+    archive: zipfile.ZipFile, name: str, contacts: Iterable[tuple[ExportContact, bytes | None]], now_utc_s: float
 ) -> None:
     manifest = ET.Element("MissionPackageManifest", {"version": "2"})
     configuration = ET.SubElement(manifest, "Configuration")
@@ -134,7 +108,7 @@ def _fill(
         uids.append(contact.uid)
         digest = None if png is None else attachment_sha256(png)
         entry = f"{contact.uid}/{contact.uid}.cot"
-        archive.writestr(archive_entry(entry), cot_event(contact, now_utc_s, options, digest))
+        archive.writestr(archive_entry(entry), cot_event(contact, now_utc_s, digest))
         _content(contents, entry, {"uid": contact.uid, "name": contact.name})
         if png is not None:
             entry = f"{digest}/{file_name(contact)}.png"
@@ -157,6 +131,8 @@ TAK_ZIP: Final = Format(write_data_package, "application/zip")
 
 
 _EXPECTED: Final = "https://host:port or http://host:port"
+UPLOAD_S: Final = 15.0
+"""Time limit of a whole upload."""
 
 
 class PackageRefusedError(PortError):
@@ -169,13 +145,12 @@ class TakFiles:
     Args:
         url: Address of the server, `https://host:8443` or `http://host:8080`.
         tls: Files for `https`; the server's certificate and name are verified.
-        timeout_s: Time limit of a whole upload.
 
     Raises:
         ConfigError: The address or a file of `tls` is invalid.
     """
 
-    def __init__(self, url: str, tls: TlsFiles | None = None, timeout_s: float = 15.0) -> None:
+    def __init__(self, url: str, tls: TlsFiles) -> None:
         try:
             parts = urlsplit(url)
             host, _ = parts.hostname, parts.port
@@ -184,9 +159,8 @@ class TakFiles:
         if parts.scheme not in ("http", "https") or not host or parts.path.strip("/") or parts.query or parts.username:
             raise ConfigError("TAK server", "", url, _EXPECTED)
         self.url = f"{parts.scheme}://{parts.netloc}"
-        self._context = (tls or TlsFiles()).context() if parts.scheme == "https" else None
-        self._server_name = (tls or TlsFiles()).server_name or host
-        self._timeout_s = timeout_s
+        self._context = tls.context() if parts.scheme == "https" else None
+        self._server_name = tls.server_name or host
 
     def upload(self, name: str, package: bytes, creator: str) -> UploadedPackage:
         """Upload a package. The server identifies it by its SHA-256 digest.
@@ -217,7 +191,7 @@ class TakFiles:
                 headers,
                 context=self._context,
                 server_name=self._server_name,
-                timeout_s=self._timeout_s,
+                timeout_s=UPLOAD_S,
             )
         except OSError as error:
             raise PortError(f"{self.url}: package not uploaded: {str(error) or type(error).__name__}") from error
