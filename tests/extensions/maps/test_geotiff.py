@@ -6,7 +6,7 @@ import tifffile
 from builders import gdal
 
 from sonarpost.extensions.maps import geotiff
-from sonarpost.extensions.maps.geotiff import GeoTransform, write_image, write_tiles
+from sonarpost.extensions.maps.geotiff import GeoTransform, write_image
 from sonarpost.extensions.maps.track import utm_epsg
 from sonarpost.sonar.geometry import Position
 
@@ -46,13 +46,6 @@ def test_overviews_are_means_of_pixels_with_data(tmp_path):
         assert [page.shape for page in file.pages] == [(600, 600), (300, 300)]
         reduced = file.pages[1].asarray()
     assert reduced[0, :3].tolist() == [75, 25, 0]
-
-
-def test_impossible_sizes_are_rejected(tmp_path):
-    transform = GeoTransform(32619, (0.0, 0.0), (1.0, 0.0), (0.0, -1.0))
-    for size_px in ((0, 5), (5, 0), (1 << 20, 1 << 20)):
-        with pytest.raises(ValueError, match="tiles"):
-            write_tiles(tmp_path / "m.tif", size_px, lambda row, column: np.zeros((512, 512), np.uint8), transform)
 
 
 def test_utm_zone():

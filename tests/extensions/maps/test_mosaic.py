@@ -14,7 +14,7 @@ from builders.surveys import make_xtf
 from sonarpost.cli.main import main
 from sonarpost.errors import SurveyFileError
 from sonarpost.extensions.maps import ground_canvas, track
-from sonarpost.extensions.maps.mosaic import write_mosaic
+from sonarpost.extensions.maps.ground_images import write_mosaic
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.survey import Side
 

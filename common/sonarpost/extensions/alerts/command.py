@@ -24,7 +24,6 @@ from sonarpost.extensions.alerts.document import alert_document, needs_alert
 from sonarpost.extensions.alerts.senders import (
     AlertNotAcceptedError,
     AlertRefusedError,
-    AlertSender,
     AlertWebhook,
     Mqtt,
     read_secret,
@@ -78,7 +77,7 @@ def run(parsed: argparse.Namespace) -> int:
     endpoints, router_tls = router_of(parsed)
     logs.configure_logging("alert", log_level(parsed))
     with stop_on_signals() as stop, ExitStack() as stack:
-        sender: AlertSender = (
+        sender: AlertWebhook | Mqtt = (
             AlertWebhook(parsed.webhook, tls, secret, stop=stop) if parsed.webhook else Mqtt(parsed.mqtt, tls, secret)
         )
         stack.enter_context(closing(sender))
@@ -150,7 +149,7 @@ class AlertService:
 
     def __init__(
         self,
-        sender: AlertSender,
+        sender: AlertWebhook | Mqtt,
         sent: SentAlerts,
         threshold: float,
         *,

@@ -8,7 +8,7 @@ import time
 import uuid
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from sonarpost.errors import ConfigError, PortError
@@ -34,22 +34,6 @@ class AlertNotAcceptedError(PortError):
     """The receiver has replied, but has not accepted an alert: the cause can be this alert alone."""
 
 
-class AlertSender(Protocol):
-    """Sends one alert and returns when the receiver has accepted it."""
-
-    def send(self, alert_id: str, vessel_id: str, body: bytes) -> None:
-        """Send an alert.
-
-        Raises:
-            AlertRefusedError: The receiver has refused it.
-            AlertNotAcceptedError: The receiver has replied, but has not accepted it: send it again.
-            PortError: The receiver was not reached or did not reply: send it again.
-        """
-
-    def close(self) -> None:
-        """Close the connection."""
-
-
 def read_secret(path: Path, name: str) -> bytes:
     """Read a secret: the first line of a file.
 
@@ -68,6 +52,8 @@ def read_secret(path: Path, name: str) -> bytes:
 
 class AlertWebhook:
     """HTTP POST of each alert. TLS certificate and name are verified, and redirections are not followed.
+
+    `send` returns when the receiver has accepted the alert, as that of `Mqtt` does.
 
     Args:
         url: `https://…` or `http://…`.
@@ -97,7 +83,13 @@ class AlertWebhook:
         self._stop = stop
 
     def send(self, alert_id: str, vessel_id: str, body: bytes) -> None:
-        """Send an alert; a reply with a status of 200 to 299 accepts it."""
+        """Send an alert; a reply with a status of 200 to 299 accepts it.
+
+        Raises:
+            AlertRefusedError: The receiver has refused it.
+            AlertNotAcceptedError: The receiver has replied, but has not accepted it: send it again.
+            PortError: The receiver was not reached or did not reply: send it again.
+        """
         del vessel_id  # part of the body
         timestamp = str(int(time.time()))
         headers = {"Content-Type": "application/json", "X-Sonarpost-Id": alert_id, "X-Sonarpost-Timestamp": timestamp}
@@ -150,7 +142,11 @@ class Mqtt:
         self._client: Client | None = None
 
     def send(self, alert_id: str, vessel_id: str, body: bytes) -> None:
-        """Publish an alert; the broker's acknowledgement accepts it."""
+        """Publish an alert; the broker's acknowledgement accepts it.
+
+        Raises:
+            PortError: The broker was not reached or did not reply: send it again.
+        """
         del alert_id  # part of the body
         try:
             client = self._connected()

@@ -18,8 +18,7 @@ from sonarpost.extensions.maps.coverage import (
     write_coverage_geopackage,
 )
 from sonarpost.extensions.maps.ground_canvas import MIN_RESOLUTION_M
-from sonarpost.extensions.maps.mosaic import write_mosaic
-from sonarpost.extensions.maps.waterfall import write_waterfalls
+from sonarpost.extensions.maps.ground_images import write_mosaic, write_waterfalls
 
 WRITERS: Final[Mapping[str, Callable[[Path, Sequence[CoveragePolygon]], None]]] = {
     ".gpkg": write_coverage_geopackage,

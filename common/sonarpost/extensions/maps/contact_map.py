@@ -39,18 +39,15 @@ def contact_map(survey: Survey, detection: Detection, side_m: float, pixel_m: fl
     Args:
         survey: The pings in which the contact was detected.
         detection: The contact, in the centre of the image.
-        side_m: Side of the square, up to 50 m.
+        side_m: Side of the square.
         pixel_m: Side of a pixel.
 
     Returns:
         The image; None if position, altitude or distance between pings is unknown.
 
     Raises:
-        ValueError: A side outside the range, or a pixel that is not positive.
         SurveyFileError: The pixels are too small for the range of the sonar.
     """
-    if not 0 < pixel_m <= side_m <= 50:
-        raise ValueError(f"side of {side_m} m with pixels of {pixel_m} m, expected pixels within 50 m")
     if detection.position is None or detection.altitude_m is None or detection.pixel_along_m is None:
         return None
     # The corners of the square, and as much again for a heading that differs from the course.

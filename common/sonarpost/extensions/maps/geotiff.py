@@ -27,8 +27,6 @@ from sonarpost.files import atomic_file
 Grey = npt.NDArray[np.uint8]
 
 TILE_PX: Final = 512
-MAX_TILES: Final = 1 << 17
-"""Maximum number of tiles of an image: 34 gigapixels."""
 _CLASSIC_BYTES: Final = (1 << 32) - (1 << 20)
 _BYTE, _ASCII, _SHORT, _LONG, _DOUBLE, _LONG8 = 1, 2, 3, 4, 12, 16
 _TYPE_CODES: Final = {_BYTE: "B", _ASCII: "s", _SHORT: "H", _LONG: "I", _DOUBLE: "d", _LONG8: "Q"}
@@ -74,7 +72,6 @@ def write_image(path: Path, image: Grey, transform: GeoTransform) -> None:
     """Write an image in memory, shape (rows, columns), uint8; 0 means no data.
 
     Raises:
-        ValueError: An empty image, or one that is too large.
         OSError: The file cannot be written.
     """
 
@@ -99,7 +96,6 @@ def write_tiles(
         transform: Place of the image.
 
     Raises:
-        ValueError: An empty image, or one of more than `MAX_TILES` tiles.
         OSError: A file cannot be written.
     """
     levels = _levels(size_px)
@@ -115,20 +111,7 @@ def write_tiles(
             shutil.copyfileobj(packed, out, 1 << 20)
 
 
-def check_size(size_px: tuple[int, int]) -> None:
-    """Check that an image of this size can be written.
-
-    Raises:
-        ValueError: It is empty or has more than `MAX_TILES` tiles.
-    """
-    height_px, width_px = size_px
-    tiles = math.ceil(height_px / TILE_PX) * math.ceil(width_px / TILE_PX)
-    if height_px < 1 or width_px < 1 or tiles > MAX_TILES:
-        raise ValueError(f"image of {height_px} x {width_px} px, expected 1 to {MAX_TILES} tiles of {TILE_PX} px")
-
-
 def _levels(size_px: tuple[int, int]) -> list[_Level]:
-    check_size(size_px)
     levels = [_Level(*size_px, [], [])]
     while max(levels[-1].height_px, levels[-1].width_px) > TILE_PX:
         last = levels[-1]

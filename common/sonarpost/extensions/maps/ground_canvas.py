@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.extensions.maps.geotiff import TILE_PX, GeoTransform, Grey, check_size
+from sonarpost.extensions.maps.geotiff import TILE_PX, GeoTransform, Grey
 from sonarpost.extensions.maps.track import MAX_GAP_M, MAX_GAP_S, Track
 from sonarpost.sonar.ground_range import beam_normalised, ground_range_image
 from sonarpost.sonar.survey import FloatImage, Side
@@ -24,6 +24,8 @@ from sonarpost.sonar.survey import FloatImage, Side
 FloatArray = npt.NDArray[np.float64]
 
 MIN_RESOLUTION_M: Final = 0.01
+MAX_TILES: Final = 1 << 17
+"""Maximum number of tiles of an image: 34 gigapixels."""
 NADIR_DEG: Final = 10.0
 """Angle from the vertical within which the seabed is left out: there a sample covers metres of it."""
 _STEP: Final = 0.7
@@ -177,9 +179,8 @@ def checked_size(out: Path, size_px: tuple[int, int]) -> tuple[int, int]:
     Raises:
         SurveyFileError: It would be too large; the error names its file.
     """
-    try:
-        check_size(size_px)
-    except ValueError as error:
+    rows, columns = (math.ceil(size / TILE_PX) for size in size_px)
+    if rows * columns > MAX_TILES:
         size = f"{size_px[0]} x {size_px[1]} px"
-        raise SurveyFileError(str(out), "size", size, "a smaller area or a coarser resolution") from error
+        raise SurveyFileError(str(out), "size", size, "a smaller area or a coarser resolution")
     return size_px

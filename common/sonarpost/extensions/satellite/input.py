@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
 
@@ -38,31 +37,6 @@ CHECK_S = 1.0
 RETRY_S = 30.0
 
 
-@dataclass(frozen=True, slots=True)
-class Access:
-    """Secrets of the webhook and of the gateway.
-
-    Attributes:
-        token: Part of the webhook's address.
-        account: Account at the gateway.
-    """
-
-    token: str
-    account: RockBlockAccount
-
-    @classmethod
-    def read(cls, config: ShortMessageOptions) -> Access:
-        """Read the files of a configuration.
-
-        Raises:
-            ConfigError: A secret cannot be read, is too short, or has other characters.
-        """
-        token = _secret(config.token_file, MIN_TOKEN_CHARACTERS)
-        if not re.fullmatch(r"[A-Za-z0-9_-]+", token):
-            raise ConfigError(str(config.token_file), "", "other characters", "letters, digits, - and _")
-        return cls(token, RockBlockAccount(config.gateway, config.username, _secret(config.password_file, 1)))
-
-
 class ShortMessages(Input):
     """Accepts messages of terminals. Their records enter c2's inbox as if a relay had delivered them.
 
@@ -80,7 +54,10 @@ class ShortMessages(Input):
     def __init__(self, config: C2Config, options: ShortMessageOptions) -> None:
         self._config = options
         self._site = config.site
-        self._access = Access.read(self._config)
+        self._token = _secret(options.token_file, MIN_TOKEN_CHARACTERS)
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", self._token):
+            raise ConfigError(str(options.token_file), "", "other characters", "letters, digits, - and _")
+        self._account = RockBlockAccount(options.gateway, options.username, _secret(options.password_file, 1))
         self._decoder = Decoder(config.codebooks)
         self._webhook: Webhook | None = None
         self._lock = threading.Lock()
@@ -114,7 +91,7 @@ class ShortMessages(Input):
         self._check_capacity = service.check_capacity
         self._before_accepting = service.before_accepting
         self._log = service.interval_log(log, logging.WARNING, "Short message refused or not acknowledged")
-        self._webhook = Webhook(self._config.host, self._config.port, self._access.token, self._receive)
+        self._webhook = Webhook(self._config.host, self._config.port, self._token, self._receive)
         log.info("Webhook for short messages open", extra=kv(host=self._config.host, port=self._webhook.port))
 
     @override
@@ -227,7 +204,7 @@ class ShortMessages(Input):
             return
         try:
             for data in acknowledgements:
-                self._access.account.send(imei, data)
+                self._account.send(imei, data)
                 self._count("short_messages_acknowledged")
         except BaseException:
             with self._lock:

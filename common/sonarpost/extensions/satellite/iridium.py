@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 import serial
 
@@ -50,24 +50,6 @@ class ExchangeResult:
     sent: bool
     received: bytes | None = None
     waiting: int = 0
-
-
-class MessageBearer(Protocol):
-    """Carries messages of at most 340 bytes."""
-
-    def exchange(self, outgoing: bytes | None) -> ExchangeResult:
-        """Send a message, or None to fetch only; return what was received in the same exchange.
-
-        Raises:
-            PortError: The terminal is not reached.
-            TerminalError: It replied in an unexpected way.
-        """
-
-    def stop(self) -> None:
-        """End the exchange in progress with a PortError; called from another thread."""
-
-    def close(self) -> None:
-        """Close the port; called from the thread of `exchange`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Final
 from urllib.parse import parse_qs, urlencode, urlsplit
 
-from sonarpost.errors import BadInputError, ConfigError, DeliveryError
+from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.limits import limit
 from sonarpost.network import http_client
 from sonarpost.network.connections import ConnectionLimits, LimitedHandler, LimitedServer
@@ -160,10 +160,6 @@ class RockBlockAccount:
     url: str
     username: str
     password: str
-
-    def __post_init__(self) -> None:
-        if urlsplit(self.url).scheme not in ("http", "https"):
-            raise ConfigError("gateway", "url", self.url, "http://… or https://…")
 
     def send(self, imei: str, data: bytes) -> None:
         """Send a message to a terminal.

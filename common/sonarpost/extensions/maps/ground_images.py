@@ -1,16 +1,19 @@
-"""Georeferenced waterfall: a straight line of a recording as GeoTIFF, along-track upwards.
+"""Georeferenced images of recordings as cloud-optimised GeoTIFF: a mosaic, and waterfalls of straight lines.
 
-The image is rotated, not distorted: columns are at right angles to the line, port on the left, and the last ping is at
-the top. Every echo is at its position, so that an affine transformation gives the position of each pixel. A waterfall
-in slant range has no such transformation: slant range is not proportional to the distance on the seabed, and the line
-is never quite straight. Ground control points would describe it, but GDAL interpolates between them: with its default
-polynomial, positions of a slant-range waterfall are metres off.
+A waterfall is rotated, not distorted: columns are at right angles to the line, port on the left, and the last ping is
+at the top. Every echo is at its position, so that an affine transformation gives the position of each pixel. A
+waterfall in slant range has no such transformation: slant range is not proportional to the distance on the seabed, and
+the line is never quite straight. Ground control points would describe it, but GDAL interpolates between them: with its
+default polynomial, positions of a slant-range waterfall are metres off.
+
+Memory does not depend on the length of the recordings: they are read twice in strips, and tiles of an image that are
+not in use are in a temporary file.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +23,9 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.extensions.maps.coverage import Coverage, outline_of
 from sonarpost.extensions.maps.geotiff import GeoTransform, write_tiles
-from sonarpost.extensions.maps.ground_canvas import MIN_RESOLUTION_M, GroundCanvas, checked_size
+from sonarpost.extensions.maps.ground_canvas import GroundCanvas, checked_size
 from sonarpost.extensions.maps.track import Track, far_m, first_position, is_gap, no_positions, tracks, utm_epsg
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection
@@ -37,6 +41,61 @@ MIN_LINE_M: Final = 20.0
 """Shorter lines, the parts of a turn, have no waterfall."""
 _STEP_M: Final = 2.0
 _TURN_PINGS: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class MosaicResult:
+    """What was written.
+
+    Attributes:
+        transform: Place of the image.
+        size_px: Rows and columns.
+        coverage: The covered seabed, and the number of pings.
+    """
+
+    transform: GeoTransform
+    size_px: tuple[int, int]
+    coverage: Coverage
+
+
+def write_mosaic(
+    paths: Sequence[Path],
+    out: Path,
+    resolution_m: float,
+    options: SurveyOptions | None = None,
+) -> MosaicResult:
+    """Write the mosaic of recordings as a cloud-optimised GeoTIFF in the UTM zone of the first position.
+
+    Grey is 1 to 255, 128 at the mean echo of an angle, and 0 without data.
+
+    Args:
+        paths: Survey files.
+        out: GeoTIFF to create or replace.
+        resolution_m: Side of a pixel, from 0.01 m.
+        options: Of the recordings.
+
+    Raises:
+        SurveyFileError: A recording cannot be read, none has a ping with position, heading and altitude, or the image
+            would be too large.
+        OSError: A file cannot be written.
+    """
+    with ExitStack() as stack:
+        sources = [stack.enter_context(open_survey(path, options)) for path in paths]
+        epsg = utm_epsg(first_position(sources))
+        projection = Projection(f"EPSG:{epsg}")
+        outline = outline_of(sources, projection)
+        west_m = math.floor(outline.low_m[0] / resolution_m) * resolution_m
+        north_m = math.ceil(outline.high_m[1] / resolution_m) * resolution_m
+        width_px = math.floor((outline.high_m[0] - west_m) / resolution_m) + 1
+        height_px = math.floor((north_m - outline.low_m[1]) / resolution_m) + 1
+        checked_size(out, (height_px, width_px))
+        transform = GeoTransform(epsg, (west_m, north_m), (resolution_m, 0.0), (0.0, -resolution_m))
+        canvas = stack.enter_context(GroundCanvas((height_px, width_px), transform, out.parent))
+        for source in sources:
+            for track in tracks(source, projection):
+                canvas.draw(track)
+        write_tiles(out, (height_px, width_px), canvas.grey, transform)
+        return MosaicResult(transform, (height_px, width_px), outline.coverage())
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,11 +181,8 @@ def write_waterfalls(
     Raises:
         SurveyFileError: The recording cannot be read, it has no straight line of 20 m with position, heading and
             altitude, or an image would be too large.
-        ValueError: The resolution is too fine.
         OSError: A file cannot be written.
     """
-    if not resolution_m >= MIN_RESOLUTION_M:
-        raise ValueError(f"resolution of {resolution_m} m, expected at least {MIN_RESOLUTION_M} m")
     with open_survey(path, options) as source:
         epsg = utm_epsg(first_position([source]))
         projection = Projection(f"EPSG:{epsg}")
