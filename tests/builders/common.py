@@ -7,9 +7,10 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from random import SystemRandom
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 GOLDEN_FOLDER = REPOSITORY / "tests" / "golden"
-
 
 WAIT_S = 300.0
 """Default limit of waits: only a test that fails waits so long."""
@@ -60,6 +60,16 @@ def eventually(condition: Callable[[], bool], timeout_s: float = WAIT_S, what: s
         if time.monotonic() > deadline:
             pytest.fail(f"{what} did not come true within {timeout_s} s")
         time.sleep(0.01)  # noqa: TID251 the poll of every wait
+
+
+@contextmanager
+def running(service: Any) -> Iterator[Any]:
+    """Start a service; it is stopped when the context ends."""
+    assert service.start()
+    try:
+        yield service
+    finally:
+        service.stop()
 
 
 def publish_once(session: zenoh.Session, key: str, payload: bytes, encoding: str | None = None) -> None:

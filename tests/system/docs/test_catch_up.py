@@ -6,7 +6,7 @@ import sys
 
 import pytest
 import zenoh
-from builders.common import REPOSITORY, WAIT_S, eventually
+from builders.common import REPOSITORY, WAIT_S, eventually, running
 from builders.exports import image
 from builders.line_program import run_program
 from builders.record_samples import SAMPLES
@@ -57,10 +57,8 @@ def test_json_examples_equal_the_encoded_records():
 
 @pytest.fixture
 def c2(platform, tmp_path):
-    service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out"))
-    assert service.start()
-    yield service
-    service.stop()
+    with running(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out"))) as service:
+        yield service
 
 
 def test_selectors_are_valid_and_zenoh_parses_them(c2, client):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import msgpack
 import pytest
-from builders.common import REPOSITORY, WAIT_S, eventually
+from builders.common import REPOSITORY, WAIT_S, eventually, running
 from builders.line_program import LineProgram, run_program
 from builders.record_samples import SAMPLES
 
@@ -112,9 +112,7 @@ def run(tmp_path, run_program):
 
 
 def test_published_contact_reaches_consumer_and_watcher(run, router, platform):
-    consumer = RecordingConsumer(platform("uuv-1"))
-    consumer.start()
-    try:
+    with running(RecordingConsumer(platform("uuv-1"))) as consumer:
         watching = run("watch", router)
         while not watching.lines.get(timeout=120).startswith("sonarpost/v1/uuv-1/health/compressor health"):
             pass
@@ -124,8 +122,6 @@ def test_published_contact_reaches_consumer_and_watcher(run, router, platform):
         while not line.startswith(keys.contact_detected("uuv-1")):
             line = watching.lines.get(timeout=120)
         assert line.split() == [keys.contact_detected("uuv-1"), "snippet"]
-    finally:
-        consumer.stop()
     snippet = consumer.received[0]
     assert snippet.contact == Contact(
         contact_id="my-detector-1",
@@ -147,22 +143,16 @@ def test_delivery_program_waits_for_its_consumer(run, router, client, platform, 
     program = run("deliver", router, DecisionConsumer.key, "relay", str(tmp_path / "record"))
     eventually(lambda: hex_block("decision") in asked, what="an attempt without a reply")
     silent.undeclare()
-    consumer = DecisionConsumer(platform("vessel-1"))
-    consumer.start()
-    try:
+    with running(DecisionConsumer(platform("vessel-1"))) as consumer:
         program.wait()
         assert program.lines.get(timeout=120) == "stored"
         eventually(lambda: consumer.received == [SAMPLES["decision-bare"]])
-    finally:
-        consumer.stop()
 
 
 def test_delivery_program_sends_pieces_and_reports_a_refusal(run, router, platform, tmp_path):
     """100 kB that are not a snippet: the consumer refuses them after the last piece."""
     (tmp_path / "record").write_bytes(msgpack.packb({"type": "snippet", "v": 1, "filler": b"x" * 100_000}))
-    consumer = RecordingConsumer(platform("uuv-1"))
-    consumer.start()
-    try:
+    with running(RecordingConsumer(platform("uuv-1"))) as consumer:
         program = run("deliver", router, RecordingConsumer.key, "compressor", str(tmp_path / "record"))
         program.wait()
         assert (
@@ -170,8 +160,6 @@ def test_delivery_program_sends_pieces_and_reports_a_refusal(run, router, platfo
             == f"refused {RecordingConsumer.key}: contact: got 'nothing', expected a value"
         )
         assert consumer.store.refused_count() == 1
-    finally:
-        consumer.stop()
     assert consumer.received == []
 
 
@@ -201,18 +189,13 @@ def test_record_for_two_consumers_is_published_with_both_sequence_numbers(client
     queue_decision(producer, "op_modem", 1)
     queue_decision(producer, "relay", 2)
     queue_decision(producer, "op_modem", 2)
-    producer.start()
-    try:
+    with running(producer):
         eventually(lambda: len(seen) == 3)
         assert sorted(seen) == [("op_modem", 1, "d1"), ("op_modem", 2, "d2"), ("relay", 1, "d2")]
-    finally:
-        producer.stop()
 
 
 def test_consumer_ignores_publications_with_an_attachment(client, platform):
-    consumer = DecisionConsumer(platform("vessel-1"))
-    consumer.start()
-    try:
+    with running(DecisionConsumer(platform("vessel-1"))) as consumer:
         publisher = client.declare_publisher(DecisionConsumer.key)
         eventually(lambda: publisher.matching_status.matching)
         publisher.put(b"rubbish", attachment=b"anything")
@@ -221,13 +204,9 @@ def test_consumer_ignores_publications_with_an_attachment(client, platform):
         publisher.put(hex_block("decision"))
         eventually(lambda: len(consumer.received) == 1)
         assert consumer.store.refused_count() == 0
-    finally:
-        consumer.stop()
 
 
 def test_service_answers_the_example_query_with_the_example_reply(client, platform):
-    consumer = DecisionConsumer(platform("vessel-1"))
-    consumer.start()
     selector = "sonarpost/v1/vessel-1/contact/decision/delivery/relay"
 
     def ask(payload, attached):
@@ -236,7 +215,7 @@ def test_service_answers_the_example_query_with_the_example_reply(client, platfo
         assert str(received.ok.key_expr) == selector
         return received.ok.payload.to_bytes()
 
-    try:
+    with running(DecisionConsumer(platform("vessel-1"))) as consumer:
         querier = client.declare_querier(selector)
         eventually(lambda: querier.matching_status.matching)
         assert ask(hex_block("decision"), hex_block("attachment")) == hex_block("reply")
@@ -255,5 +234,3 @@ def test_service_answers_the_example_query_with_the_example_reply(client, platfo
         assert refused.status == "refused"
         assert f"{selector}: payload: got b''" in refused.reason
         assert consumer.store.refused_count() == 2
-    finally:
-        consumer.stop()

@@ -13,15 +13,14 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from builders.common import REPOSITORY, eventually
+from builders.common import REPOSITORY, eventually, running
 from builders.exports import decision, image
 from builders.line_program import run_program
 from builders.rest_interface import rest_interface
-from builders.shore import number_images
+from builders.shore import number_images, relayed
 
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config
-from sonarpost.messages import ReconstructedImage, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
@@ -34,10 +33,8 @@ JAVASCRIPT = EXAMPLES / "javascript" / "catch_up.mjs"
 
 @pytest.fixture
 def c2(platform, tmp_path):
-    service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out", json_mirror=True))
-    assert service.start()
-    yield service
-    service.stop()
+    with running(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out", json_mirror=True))) as service:
+        yield service
 
 
 @pytest.fixture
@@ -56,10 +53,7 @@ def pair(platform, database_url, monkeypatch):
 def accept(c2, *records):
     before = c2.health().counters.get("records_handled", 0)
     for record in records:
-        is_image = isinstance(record, ReconstructedImage)
-        key = keys.image_reconstructed("vessel-1") if is_image else keys.contact_decision("vessel-1")
-        envelope = Relayed(vessel_id="vessel-1", key=key, payload=wire.encode(record), relayed_utc_s=1.0)
-        c2.session.put(keys.shore_inbox("vessel-1"), wire.encode(envelope))
+        c2.session.put(keys.shore_inbox("vessel-1"), wire.encode(relayed(record)))
     eventually(lambda: c2.health().counters.get("records_handled", 0) == before + len(records), what="acceptance")
 
 

@@ -7,12 +7,13 @@ import sys
 
 import numpy as np
 import pytest
-from builders.common import REPOSITORY, eventually
+from builders.common import REPOSITORY, eventually, running
 from builders.exports import decision, image
+from builders.shore import relayed
 from PIL import Image
 
 from sonarpost import keys, wire
-from sonarpost.messages import Pixels, ReconstructedImage, Relayed
+from sonarpost.messages import Pixels
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 
@@ -21,17 +22,8 @@ EXAMPLE = REPOSITORY / "examples" / "shore_subscriber.py"
 
 @pytest.fixture
 def c2(router, platform, tmp_path):
-    service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out"))
-    assert service.start()
-    yield service
-    service.stop()
-
-
-def relay(c2, record):
-    is_image = isinstance(record, ReconstructedImage)
-    key = keys.image_reconstructed("vessel-1") if is_image else keys.contact_decision("vessel-1")
-    envelope = Relayed(vessel_id="vessel-1", key=key, payload=wire.encode(record), relayed_utc_s=1.0)
-    c2.session.put(keys.shore_inbox("vessel-1"), wire.encode(envelope))
+    with running(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out"))) as service:
+        yield service
 
 
 def test_example_is_short_and_needs_only_zenoh_and_msgpack():
@@ -50,9 +42,9 @@ def test_example_prints_records_and_saves_images(router, c2, tmp_path):
     command = [sys.executable, "-I", str(EXAMPLE), router, str(saved)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         eventually(lambda: publisher.matching_status.matching, what="subscription of the example")
-        relay(c2, image("0001", pixels=Pixels.from_array(wide)))
-        relay(c2, image("0002", pixels=Pixels.from_array(grey), version=2).model_copy(update={"contact": None}))
-        relay(c2, decision("0001", verdict="mine_like"))
+        second = image("0002", pixels=Pixels.from_array(grey), version=2).model_copy(update={"contact": None})
+        for record in (image("0001", pixels=Pixels.from_array(wide)), second, decision("0001", verdict="mine_like")):
+            c2.session.put(keys.shore_inbox("vessel-1"), wire.encode(relayed(record)))
         lines = [process.stdout.readline() for _ in range(3)]
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=120)
