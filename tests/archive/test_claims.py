@@ -29,7 +29,7 @@ CODECS = [name for name in REGISTRY.names() if name != "jpegxl"]  # the library 
 FILES_FACTOR, FILES_BYTES = 8, 4000
 """Files of an image of which no pixel arrived, for each byte that was sent, and in addition."""
 MEMORY_BYTES = 128 * MAX_SIDE_PX * MAX_SIDE_PX
-"""Memory that decoding takes, whatever a stream says."""
+"""Limit of the memory that decoding takes, for any stream."""
 
 sides = st.none() | st.integers(0, 5000)
 headers = st.sampled_from(

@@ -126,7 +126,7 @@ def classified_mission(out_dir: Path) -> Path:
 
 
 def reviewed_mission(out_dir: Path) -> Path:
-    """Write a contact whose decision is withdrawn, a disputed one, and one whose dispute is settled."""
+    """Write a contact whose decision is withdrawn, a disputed one, and one whose dispute has a decision."""
     later = {"decided_utc_s": FIRST_UTC_S + 700}
     return store(
         out_dir,

@@ -2,7 +2,7 @@
 
 The log holds one operation a line, as JSON, as the test harness observed it: which records a source has queued durably,
 which records are in the durable output of each consumer, and which faults were injected. A `consumer` line declares a
-process to which the rules apply. The command prints the verdict of each log; its exit status is 1 after a violation.
+process to which the rules apply.
 
 Rules, for each declared consumer and the keys that it declares:
 

@@ -19,7 +19,8 @@ from typing import Literal
 import msgpack
 import zenoh
 
-from builders.hostile_site import HOSTILE, Site, attack_modules, coded_part, threads
+from builders.extensions import modules
+from builders.hostile_site import HOSTILE, Site, coded_part, threads
 from sonarpost import keys, wire
 from sonarpost.messages import ImagePart
 
@@ -345,7 +346,7 @@ def hostile_recordings(site: Site) -> Iterator[None]:
 
 def rows() -> list[Row]:
     """Return the attacks on the core, and those of `attacks.py` of the tests of each extension."""
-    return [*ROWS, *(row for module in attack_modules() for row in module.ROWS)]
+    return [*ROWS, *(row for module in modules("attacks") for row in module.ROWS)]
 
 
 ROWS: tuple[Row, ...] = (

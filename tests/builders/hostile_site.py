@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from http.client import HTTPException
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import msgpack
@@ -27,6 +26,7 @@ import numpy as np
 import zenoh
 
 from builders.common import REPOSITORY, WAIT_S, eventually, free_port
+from builders.extensions import modules
 from builders.fleet_certificates import World
 from sonarpost import keys, wire
 from sonarpost.bus.session import client_config
@@ -51,12 +51,6 @@ def coded_part(number: int, side_px: int = 48) -> ImagePart:
     pixels = np.random.default_rng(number).integers(0, 256, (side_px, side_px), dtype=np.uint8)
     stream = default_registry().create("emb", CodecResources(strength=0.0)).encode(pixels, 200)
     return ImagePart(u="uuv-1", i=f"{number:04d}", n=1, t=1_700_000_000.0 + number, p=stream)
-
-
-def attack_modules() -> list[ModuleType]:
-    """Return `attacks.py` of the tests of each extension: its rows `ROWS`, and `c2_table`, which adds to `[c2]`."""
-    names = sorted(path.parent.name for path in REPOSITORY.glob("tests/extensions/*/attacks.py"))
-    return [import_module(f"extensions.{name}.attacks") for name in names]
 
 
 class Sender:
@@ -389,8 +383,9 @@ def running_site(folder: Path, world: World, decode_workers: int) -> Iterator[Si
     thread.start()
     try:
         site.incoming.mkdir()
-        modules = [module for module in attack_modules() if hasattr(module, "c2_table")]
-        added = "".join(stack.enter_context(module.c2_table(site)) for module in modules)
+        # `c2_table` of an extension's attacks adds to `[c2]`.
+        tables = [module.c2_table for module in modules("attacks") if hasattr(module, "c2_table")]
+        added = "".join(stack.enter_context(table(site)) for table in tables)
         site.start(
             "c2",
             "shore-1",

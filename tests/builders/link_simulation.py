@@ -89,7 +89,7 @@ class Simulation:
     Args:
         link: The link.
         senders: Senders that share it.
-        commit_s: Time of a commit; queries that arrive meanwhile share the next one.
+        commit_s: Time of a commit; queries that arrive until it ends share the next one.
     """
 
     def __init__(self, link, *senders, commit_s=0.002):

@@ -171,11 +171,13 @@ class VesselAndShore:
         self.history.fault(name, number.name)
         self._processes[name].send_signal(number)
 
-    def start_source(self, folder="source"):
+    def start_source(self):
         """Start the outbox of the test, with its own store."""
-        state = self.folder / "state" / folder
         platform = PlatformConfig(
-            id=VESSEL, router=(self._endpoint("router-vessel"),), state_dir=state, health_interval_s=60.0
+            id=VESSEL,
+            router=(self._endpoint("router-vessel"),),
+            state_dir=self.folder / "state" / "source",
+            health_interval_s=60.0,
         )
         self._source = ImageSource(platform, lambda image: self._log("acknowledged", "relay", image))
         assert self._source.start()
