@@ -83,10 +83,10 @@ def shown(key, payload, encoding):
 class _Server(ThreadingHTTPServer):
     """HTTP server with the documented interface of Zenoh's REST plugin, as far as the JavaScript example uses it.
 
-    The embedded router has no plugins. `GET {selector}` returns a JSON list of replies, with `Accept: text/event-stream`
-    server-sent events of publications; the path is the key expression, the query part the parameters. As in the plugin,
-    all replies of a key are returned only with a valid `_time`, and only values of the encodings `application/json` and
-    `text/plain` are inserted as they are.
+    The embedded router has no plugins. `GET {selector}` returns a JSON list of replies, with `Accept:
+    text/event-stream` server-sent events of publications; the path is the key expression, the query part the
+    parameters. As in the plugin, all replies of a key are returned only with a valid `_time`, and only values of the
+    encodings `application/json` and `text/plain` are inserted as they are.
     """
 
     def __init__(self, session):
