@@ -8,8 +8,6 @@ The names of this package are the public interface; they follow semantic version
 without notice. Names are imported on first use: `import sonarpost` alone loads no library.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING
 

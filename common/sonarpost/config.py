@@ -5,8 +5,6 @@ an error that names file, line and key. The environment variable `SONARPOST_{TAB
 is parsed as a TOML value, or used as a string if it is not one. An empty variable overrides nothing.
 """
 
-from __future__ import annotations
-
 import inspect
 import logging
 import stat
@@ -75,7 +73,7 @@ class ServiceConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
-    def check_with(self, platform: PlatformConfig) -> None:
+    def check_with(self, platform: "PlatformConfig") -> None:
         """Check the table together with `[platform]`, and the files that both name; the default accepts everything.
 
         Raises:
@@ -168,7 +166,7 @@ class PlatformConfig(ServiceConfig):
         """The `[modem]` table of the same file."""
         return self._modem
 
-    def with_modem(self, modem: ModemTable) -> PlatformConfig:
+    def with_modem(self, modem: ModemTable) -> "PlatformConfig":
         """Return this table with another `[modem]` table."""
         copy = self.model_copy()
         copy._modem = modem  # noqa: SLF001 - an object of this class

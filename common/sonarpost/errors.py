@@ -4,8 +4,6 @@ External input (a file, a serial line, an acoustic frame, a Zenoh payload, a con
 of these errors. The message has the form `where: field: got X, expected Y`: the log line alone shows what to correct.
 """
 
-from __future__ import annotations
-
 import errno
 
 from typing_extensions import override

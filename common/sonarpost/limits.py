@@ -3,8 +3,6 @@
 Each limit is declared where it is enforced, with `limit`. docs/specifications/limits.md lists all of them.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence

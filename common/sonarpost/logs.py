@@ -4,8 +4,6 @@ A line holds the fields of its call and those of the log context: `vehicle` and 
 platform, `contact_id` a contact on the vehicle.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import math

@@ -1,7 +1,5 @@
 """End of a process: SIGINT, SIGTERM, the end of its parent, and the exit itself."""
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import os

@@ -1,7 +1,5 @@
 """`sonarpost console`: users, and the view of a folder of c2."""
 
-from __future__ import annotations
-
 import argparse
 import getpass
 import secrets
@@ -171,7 +169,7 @@ def stored_records(place: ArchivePlace) -> Iterator[ReconstructedImage | Decisio
 
 def serve_page(
     parsed: argparse.Namespace,
-    state: ConsoleState,
+    state: "ConsoleState",
     folder: Path,
     accounts: Sequence[tuple[str, str]],
     platform_id: str,
@@ -220,7 +218,7 @@ def serve_page(
             pass
 
 
-def _server(app: ConsoleApp, config: ConsoleConfig, port: int | None) -> WebServer:
+def _server(app: "ConsoleApp", config: ConsoleConfig, port: int | None) -> "WebServer":
     from sonarpost.services.console.web.server import WebServer  # noqa: PLC0415
 
     if port is not None:

@@ -1,7 +1,5 @@
 """`sonarpost encode` and `sonarpost decode`: the paper's Table III for a file or a folder."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 import sys

@@ -1,7 +1,5 @@
 """The `sonarpost` command. Its help, and the report of a misspelt command, import the module of no command."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os

@@ -3,8 +3,6 @@
 Options cannot be abbreviated: `--passphrase SECRET` would be read as `--passphrase-file` and appear in `ps`.
 """
 
-from __future__ import annotations
-
 import argparse
 import getpass
 import json

@@ -1,7 +1,5 @@
 """`sonarpost prepare`: compile the machine code of the codecs in advance."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 import sys

@@ -1,7 +1,5 @@
 """Progress of a long command on standard error: a bar on a terminal, else a line every ten seconds."""
 
-from __future__ import annotations
-
 import logging
 import sys
 import threading
@@ -53,7 +51,7 @@ class ProgressDisplay:
         self._stop = threading.Event()
         self._lines = threading.Thread(target=self._print_lines, daemon=True)
 
-    def __enter__(self) -> ProgressDisplay:
+    def __enter__(self) -> "ProgressDisplay":
         if self._console.is_terminal:
             self._bar.start()
         else:

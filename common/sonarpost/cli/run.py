@@ -1,7 +1,5 @@
 """`sonarpost run SERVICE --config FILE`, `sonarpost run all --config FILE` and `sonarpost router`."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

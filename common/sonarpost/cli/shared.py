@@ -1,7 +1,5 @@
 """Parsers, options and text functions that several commands share."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys
@@ -95,7 +93,7 @@ def add_router_options(parser: argparse.ArgumentParser) -> None:
     option(parser, "--tls-key PEM", "private key of this client", Path)
 
 
-def router_of(parsed: argparse.Namespace) -> tuple[tuple[str, ...], TlsConfig | None]:
+def router_of(parsed: argparse.Namespace) -> "tuple[tuple[str, ...], TlsConfig | None]":
     """Return router endpoints and TLS files. Command-line options override the file of --config.
 
     Raises:
@@ -137,7 +135,7 @@ def add_survey_options(parser: argparse.ArgumentParser) -> None:
     option(parser, "--frequency KHZ", "frequency of a sonar with several, the nearest one (default: the highest)")
 
 
-def survey_options_of(parsed: argparse.Namespace) -> SurveyOptions:
+def survey_options_of(parsed: argparse.Namespace) -> "SurveyOptions":
     """Return the survey options of the command line.
 
     Raises:
@@ -169,7 +167,7 @@ def projected_crs_of(parsed: argparse.Namespace) -> str | None:
     return checked_options({"projected_crs": parsed.crs}, "--crs").projected_crs
 
 
-def print_notes(info: SurveyInfo) -> None:
+def print_notes(info: "SurveyInfo") -> None:
     """Print the irregularities of a survey file on standard error."""
     for warning in info.warnings:
         print(f"note: {info.path.name}: {warning}", file=sys.stderr)

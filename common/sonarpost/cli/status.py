@@ -1,7 +1,5 @@
 """`sonarpost status`: a live table of the services of all platforms."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging

@@ -1,7 +1,5 @@
 """`sonarpost store check`, `salvage` and `quarantine`: the store of a stopped service."""
 
-from __future__ import annotations
-
 import argparse
 import time
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Key file of the acoustic link: creation, and the key that a platform's configuration names."""
 
-from __future__ import annotations
-
 import os
 import secrets
 import stat

@@ -5,8 +5,6 @@ access control identifies a peer by its CN only and reads no revocation list. A 
 again, and the platform gets a new one: `vessel-1`, `vessel-1.g2`, `vessel-1.g3`.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import re
 from collections.abc import Sequence

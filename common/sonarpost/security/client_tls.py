@@ -1,7 +1,5 @@
 """TLS of a client of another program: certificates and keys in PEM or PKCS#12 files."""
 
-from __future__ import annotations
-
 import ssl
 import tempfile
 from dataclasses import dataclass

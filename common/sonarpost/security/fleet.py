@@ -9,8 +9,6 @@
 The index is written before a certificate, so that it lists every certificate that exists.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import time
@@ -115,7 +113,7 @@ class FleetIndex(BaseModel):
     prepared: tuple[PreparedName, ...] = ()
 
     @classmethod
-    def read(cls, folder: Path) -> FleetIndex:
+    def read(cls, folder: Path) -> "FleetIndex":
         """Read the index of an authority.
 
         Raises:
@@ -175,7 +173,7 @@ class FleetIndex(BaseModel):
         generation = 1 + max((certificates.platform_of(name)[1] for name in names), default=0)
         return certificates.common_name(platform, generation)
 
-    def with_revoked(self, name: str, now_utc_s: float, reason: str) -> FleetIndex:
+    def with_revoked(self, name: str, now_utc_s: float, reason: str) -> "FleetIndex":
         """Return the index with all certificates of a common name revoked."""
         update = {"revoked_utc_s": now_utc_s, "reason": reason}
         entries = tuple(
@@ -214,7 +212,7 @@ class Fleet:
         passphrase: bytes | None = None,
         days: int = AUTHORITY_DAYS,
         now_utc_s: Callable[[], float] = time.time,
-    ) -> Fleet:
+    ) -> "Fleet":
         """Create an authority in a new folder.
 
         Args:

@@ -9,8 +9,6 @@ never learns of a subscription at the shore and does not send its publications o
 connects to enforces the rules; the peer's own router need not be trusted.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """TLS files of a host: check at the start, with the reason that Zenoh would not report, and monitor of the expiry."""
 
-from __future__ import annotations
-
 import logging
 import stat
 import time

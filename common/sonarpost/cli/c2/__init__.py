@@ -1,7 +1,5 @@
 """`sonarpost c2`: lists, copies, exports and watches the contacts of a shore site, and sends commands and comments."""
 
-from __future__ import annotations
-
 from sonarpost.cli.c2 import migrate, stored, tasking, watch
 from sonarpost.cli.parsing.parser import CommandParser
 

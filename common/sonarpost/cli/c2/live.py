@@ -1,7 +1,5 @@
 """Live contacts of a shore site, for commands that pass them on to other programs."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 The command can be interrupted and repeated: what the database has is not copied again. It deletes no file.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 from collections import Counter

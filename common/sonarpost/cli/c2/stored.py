@@ -1,7 +1,5 @@
 """`sonarpost c2 ls`, `get` and `export`: list, copy and export the records in the archive of c2."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math
@@ -54,7 +52,7 @@ class RecordFilter:
     until_utc_s: float = math.inf
 
     @classmethod
-    def of(cls, parsed: argparse.Namespace) -> RecordFilter:
+    def of(cls, parsed: argparse.Namespace) -> "RecordFilter":
         """Return the filter of a command line.
 
         Raises:

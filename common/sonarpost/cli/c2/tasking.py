@@ -1,7 +1,5 @@
 """`sonarpost c2 command` and `comment`: send a command for a vehicle or an expert's comment through c2 to a vessel."""
 
-from __future__ import annotations
-
 import argparse
 import getpass
 import threading

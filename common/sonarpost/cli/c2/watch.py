@@ -1,7 +1,5 @@
 """`sonarpost c2 watch`: prints a line for each record that a shore site accepts."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """`sonarpost config example` and `sonarpost config check`, and the check that other commands use."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -1,7 +1,5 @@
 """`sonarpost install-units`: write the systemd units of a platform."""
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """`sonarpost modem ping`: ask a modem for the acoustic travel time to another one, without any service."""
 
-from __future__ import annotations
-
 import argparse
 import queue
 import time

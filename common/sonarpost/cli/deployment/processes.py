@@ -1,7 +1,5 @@
 """Child processes of a command, by name: started, stopped in order, and ended with their parent."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import time

@@ -1,7 +1,5 @@
 """`sonarpost run all`: all services of a platform and its router in one terminal, for tests on a bench."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

@@ -3,8 +3,6 @@
 `sonarpost.cli.detection.images` has the option --images, which scores images instead.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import hashlib

@@ -1,7 +1,5 @@
 """`sonarpost detect --images DIR`: the confidence of every image of a folder, without navigation."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

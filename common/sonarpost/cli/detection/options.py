@@ -1,7 +1,5 @@
 """Options of `sonarpost detect`: `--pick` places of contacts, `--transmissions` of the vehicle's modem."""
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json

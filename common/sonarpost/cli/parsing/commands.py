@@ -1,7 +1,5 @@
 """Table of the commands: summaries, modules, examples, extras; the commands of extensions and plug-ins."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache

@@ -1,7 +1,5 @@
 """`sonarpost completion SHELL`: a script that completes commands, actions and options; file names elsewhere."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The argument parser of every command: global options, actions, usage errors with a suggestion, an example."""
 
-from __future__ import annotations
-
 import argparse
 import difflib
 import re
@@ -52,7 +50,7 @@ class CommandParser(argparse.ArgumentParser):
         description: str = "",
         *,
         metavar: str = "ACTION",
-    ) -> CommandParser:
+    ) -> "CommandParser":
         """Add an action and return its parser, to which options can be added.
 
         Args:
@@ -81,7 +79,7 @@ class CommandParser(argparse.ArgumentParser):
         parser.set_defaults(run=run or show_help)
         return parser
 
-    def tree(self) -> Mapping[str, CommandParser]:
+    def tree(self) -> "Mapping[str, CommandParser]":
         """Return the parsers of this command and of all its actions by name; that of `sonarpost` itself is empty."""
         found = {self.prog.partition(" ")[2]: self}
         for action in self.actions.values():

@@ -1,7 +1,5 @@
 """`sonarpost survey`: describe, draw, view and export recordings."""
 
-from __future__ import annotations
-
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.survey import info, plot
 

@@ -1,7 +1,5 @@
 """`sonarpost survey info FILE…`: contents of recordings, read in constant memory."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """`sonarpost survey plot FILE…`: waterfall with scales, and track, as PNG; rows of pings are averaged to fit."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Iterable, Iterator

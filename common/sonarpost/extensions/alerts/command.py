@@ -1,7 +1,5 @@
 """`sonarpost c2 alert`: sends an alert for each contact above a threshold to a webhook or an MQTT broker."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 import math

@@ -1,7 +1,5 @@
 """Alerts about contacts: which contacts cause one, their JSON document, and its signature."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import json

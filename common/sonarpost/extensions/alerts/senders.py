@@ -1,7 +1,5 @@
 """Ways of an alert: an HTTP webhook, an MQTT broker."""
 
-from __future__ import annotations
-
 import ssl
 import threading
 import time
@@ -160,7 +158,7 @@ class Mqtt:
             self.close()
             raise PortError(f"{self._host}:{self._port}: alert not acknowledged within {self._timeout_s:g} s")
 
-    def _connected(self) -> Client:
+    def _connected(self) -> "Client":
         if self._client is not None and self._client.is_connected():
             return self._client
         self.close()

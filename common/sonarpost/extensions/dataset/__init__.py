@@ -1,7 +1,5 @@
 """Training data: the contacts of a shore site with verdicts of operators, in COCO format."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from sonarpost.cli.parsing.commands import CommandSpec

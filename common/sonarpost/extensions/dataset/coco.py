@@ -4,8 +4,6 @@ The label is the verdict of the decision that counts (`sonarpost.review.decision
 operator's verdict is mine-like and another's is not mine-like.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime

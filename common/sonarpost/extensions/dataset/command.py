@@ -1,7 +1,5 @@
 """`sonarpost dataset export`: the contacts of a shore site with verdicts of operators, in COCO format."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

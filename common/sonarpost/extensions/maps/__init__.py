@@ -1,7 +1,5 @@
 """Maps of whole recordings: mosaic and waterfalls of the seabed as GeoTIFF, covered seabed as polygons."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from sonarpost.cli.parsing.commands import CommandSpec

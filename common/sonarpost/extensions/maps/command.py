@@ -1,7 +1,5 @@
 """`sonarpost survey coverage`, `mosaic` and `waterfall`: covered seabed as polygons, images of it as GeoTIFF."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Georeferenced image of a contact: the seabed around it, north up."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Outline of the seabed that recordings cover: polygons of the swath."""
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Sequence
@@ -86,7 +84,7 @@ def survey_coverage(paths: Sequence[Path], options: SurveyOptions | None = None)
         return outline_of(sources, projection).coverage()
 
 
-def outline_of(sources: Sequence[SurveySource], projection: Projection) -> CoverageOutline:
+def outline_of(sources: Sequence[SurveySource], projection: Projection) -> "CoverageOutline":
     """Return the outline of all pings of open recordings.
 
     Raises:

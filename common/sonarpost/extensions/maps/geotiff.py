@@ -6,8 +6,6 @@ are compressed (Deflate). Above 4 GB the file is a BigTIFF. Structures: TIFF 6.0
 GDAL's cloud-optimised GeoTIFF driver. `tifffile` is not used, because it writes the directories after the data.
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 import struct

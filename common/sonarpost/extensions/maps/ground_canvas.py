@@ -4,8 +4,6 @@ Pings are projected to a flat seabed and divided by the mean at their angle. Eac
 Between two pings the image of the nearer one is repeated. Memory does not depend on the size of the image.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections import OrderedDict
@@ -57,7 +55,7 @@ class GroundCanvas:
         self._slots: dict[int, int] = {}
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 - closed by `__exit__`
 
-    def __enter__(self) -> GroundCanvas:
+    def __enter__(self) -> "GroundCanvas":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -10,8 +10,6 @@ Memory does not depend on the length of the recordings: they are read twice in s
 not in use are in a temporary file.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """Pings in projected metres: place of the sonar, direction to starboard, and far ends of the swath."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -49,7 +47,7 @@ class Track:
     is_known: npt.NDArray[np.bool_]
     is_continued: bool
 
-    def part(self, rows: slice) -> Track:
+    def part(self, rows: slice) -> "Track":
         """Return the pings of a range of rows, counted from the first one of this track."""
         begin, end, _ = rows.indices(len(self.survey.pings))
         return Track(

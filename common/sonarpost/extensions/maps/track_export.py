@@ -1,7 +1,5 @@
 """`sonarpost survey export FILE`: the track as CSV (a line a ping) or GeoJSON, in constant memory."""
 
-from __future__ import annotations
-
 import argparse
 import csv
 import io

@@ -4,8 +4,6 @@ The schemas have the names and fields of `foxglove.CompressedImage`, `foxglove.L
 (https://docs.foxglove.dev/docs/sdk/schemas).
 """
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Iterable, Mapping

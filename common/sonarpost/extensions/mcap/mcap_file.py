@@ -4,8 +4,6 @@ Payloads are stored as they are. A channel of a sonarpost record has the message
 of the record. Derived channels for Foxglove have topics that are no keys of sonarpost; the reader skips them.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import struct

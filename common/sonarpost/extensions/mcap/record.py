@@ -1,7 +1,5 @@
 """`sonarpost record` and `sonarpost replay`: the records of a router into an MCAP file, and back."""
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import sys
@@ -100,7 +98,7 @@ class RecordQueue:
         self._samples: deque[RecordedMessage] = deque()
         self._changed = threading.Condition()
 
-    def add(self, message: RecordedMessage) -> None:
+    def add(self, message: "RecordedMessage") -> None:
         """Add a message, or drop and count it above the limit."""
         with self._changed:
             if self._bytes + len(message.payload) > self._max_bytes:
@@ -110,7 +108,7 @@ class RecordQueue:
             self._samples.append(message)
             self._changed.notify()
 
-    def take(self, timeout_s: float) -> list[RecordedMessage]:
+    def take(self, timeout_s: float) -> "list[RecordedMessage]":
         """Return all waiting messages, after at most `timeout_s` if there is none."""
         with self._changed:
             if not self._samples:
@@ -128,13 +126,13 @@ class ContactChannels:
         recording: The file.
     """
 
-    def __init__(self, recording: McapRecording) -> None:
+    def __init__(self, recording: "McapRecording") -> None:
         self._recording = recording
         self._contacts = LiveContacts()
         self._map_due_ns: int | None = None
         self._is_changed = False
 
-    def add(self, message: RecordedMessage) -> None:
+    def add(self, message: "RecordedMessage") -> None:
         """Write what is derived from one record; a coded image and an undecodable record have none."""
         record = _record_for_c2(message.key, message.payload)
         if record is None or isinstance(record, CodedImage):
@@ -239,11 +237,11 @@ def run_replay(parsed: argparse.Namespace) -> int:
 
 
 def paced(
-    messages: Iterable[RecordedMessage],
+    messages: "Iterable[RecordedMessage]",
     speed: float,
     wait: Callable[[float], bool],
     clock: Callable[[], float] = time.monotonic,
-) -> Iterator[RecordedMessage]:
+) -> "Iterator[RecordedMessage]":
     """Yield messages at `speed` times their original speed, 0 without pauses; end when `wait` returns True.
 
     Args:
@@ -277,7 +275,7 @@ class Publisher:
         self._session = session
         self._origin = watcher_origin(uuid.uuid4().bytes)
 
-    def __call__(self, message: RecordedMessage) -> None:
+    def __call__(self, message: "RecordedMessage") -> None:
         """Publish one record."""
         self.sent += 1
         digest = hashlib.sha256(message.payload).digest()
@@ -309,7 +307,7 @@ class C2Sender:
         # Deliveries are numbered for each key: that of a refused record is used too.
         self._last: dict[str, int] = {}
 
-    def __call__(self, message: RecordedMessage) -> None:
+    def __call__(self, message: "RecordedMessage") -> None:
         """Deliver one record.
 
         Raises:

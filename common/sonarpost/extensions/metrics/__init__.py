@@ -1,7 +1,5 @@
 """Health of all platforms at a router, for Prometheus."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from sonarpost.cli.parsing.commands import CommandSpec

@@ -4,8 +4,6 @@ One exporter reads the health records of all platforms that a router reaches. Se
 no Prometheus, and the radio link carries no additional data.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Final

@@ -1,7 +1,5 @@
 """`sonarpost metrics`: a Prometheus exporter of the health of all platforms at a router."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 import threading

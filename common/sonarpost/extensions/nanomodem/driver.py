@@ -8,8 +8,6 @@ because a message has at least two bytes.
 The modem does not report the end of a transmission or the start of a reception. The driver waits for the air time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final

@@ -6,8 +6,6 @@ time of their length. Sources are those of `sonarpost.extensions.nanomodem`; how
 transmission is not known, here the packet waits.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from typing import ClassVar, Final

@@ -13,8 +13,6 @@ command. Each message of the modem ends with CR LF, a command has no end. `yyyyy
 steps of 31.25 µs. The modem has no checksum on this line, so a message is valid only with its exact length and end.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import Final

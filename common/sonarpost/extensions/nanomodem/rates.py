@@ -5,8 +5,6 @@ duration of a packet in the simulator of the modem's developer (`nm3-python-simu
 bytes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final

@@ -3,8 +3,6 @@
 Neither is conformant. `docs/reference/exports.md` states what is publicly described and what is not.
 """
 
-from __future__ import annotations
-
 import re
 from datetime import UTC, datetime
 from typing import IO, Final

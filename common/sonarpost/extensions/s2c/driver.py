@@ -6,8 +6,6 @@ message for its end. After a missing answer the driver configures the modem agai
 older commands are not taken for new ones.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final

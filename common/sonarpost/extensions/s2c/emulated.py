@@ -6,8 +6,6 @@ a modem in data mode, and as `RECV` at one in command mode; data of `AT*SEND` ar
 transmits no piggyback messages and repeats no instant message.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from typing import ClassVar, Final

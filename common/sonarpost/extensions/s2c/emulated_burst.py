@@ -6,8 +6,6 @@ retransmission after a random back-off, so that two modems that transmit at the 
 modems also divide long data into several packets and adapt their bit rate to the connection; this one does not.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ In data mode a message is `+++AT<command>:<length>:<text>\r\n`; the command is e
 mode it is the text alone. Received data is binary: its length field, not an end of line, delimits it.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

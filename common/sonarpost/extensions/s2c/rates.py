@@ -1,7 +1,5 @@
 """Rates of the S2C driver: rate 0 sends a packet as an instant message, rate 1 as burst data."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Final

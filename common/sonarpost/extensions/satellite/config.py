@@ -1,7 +1,5 @@
 """Keys of satellite terminals in the tables of the relay and of c2."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -49,7 +47,7 @@ class SatelliteKeys(ServiceConfig):
         return windows
 
     @model_validator(mode="after")
-    def _check_terminal(self) -> SatelliteKeys:
+    def _check_terminal(self) -> "SatelliteKeys":
         if getattr(self, "bearer", "") == "satellite" and not self.terminal:
             raise ValueError("a terminal with bearer satellite")
         return self

@@ -1,7 +1,5 @@
 """Short messages of vessels at c2: records to the inbox, acknowledgements to the gateway."""
 
-from __future__ import annotations
-
 import logging
 import re
 import threading
@@ -51,7 +49,7 @@ class ShortMessages(Input):
 
     KEYS = ShortMessageKeys
 
-    def __init__(self, config: C2Config, options: ShortMessageOptions) -> None:
+    def __init__(self, config: "C2Config", options: ShortMessageOptions) -> None:
         self._config = options
         self._site = config.site
         self._token = _secret(options.token_file, MIN_TOKEN_CHARACTERS)
@@ -68,7 +66,7 @@ class ShortMessages(Input):
 
     @classmethod
     @override
-    def configured(cls, config: C2Config) -> Self | None:
+    def configured(cls, config: "C2Config") -> Self | None:
         """Return the input for the table of c2; None without `short_messages`."""
         options = cast(ShortMessageKeys, config).short_messages
         return None if options is None else cls(config, options)

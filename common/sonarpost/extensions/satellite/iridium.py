@@ -4,8 +4,6 @@
 a serial port or another URL of pyserial.
 """
 
-from __future__ import annotations
-
 import termios
 import threading
 import time

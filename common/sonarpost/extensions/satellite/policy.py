@@ -1,7 +1,5 @@
 """When a metered bearer may be used: windows of the day and a budget of bytes a day."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -25,7 +23,7 @@ class Window:
     end_s: float
 
     @classmethod
-    def parse(cls, text: str) -> Window:
+    def parse(cls, text: str) -> "Window":
         """Parse `HH:MM-HH:MM`.
 
         Raises:

@@ -1,7 +1,5 @@
 """Receiver of short messages: messages in, records and acknowledgements out. Without I/O and clock."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Final
 

@@ -4,8 +4,6 @@ Messages from a terminal arrive as a POST to a web address of the shore site (th
 a POST to the gateway.
 """
 
-from __future__ import annotations
-
 import hmac
 import logging
 import math

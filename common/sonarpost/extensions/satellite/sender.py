@@ -1,7 +1,5 @@
 """Sender of short messages: records in, messages out, acknowledgements in. Without I/O and clock."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Final
@@ -78,7 +76,7 @@ class QueuedItem:
         return packed
 
     @classmethod
-    def unpack(cls, data: bytes) -> QueuedItem:
+    def unpack(cls, data: bytes) -> "QueuedItem":
         """Parse the bytes of `pack`.
 
         Raises:
@@ -114,7 +112,7 @@ class PendingMessage:
         return packed
 
     @classmethod
-    def unpack(cls, data: bytes) -> PendingMessage:
+    def unpack(cls, data: bytes) -> "PendingMessage":
         """Parse the bytes of `pack`.
 
         Raises:

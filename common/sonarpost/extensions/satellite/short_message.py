@@ -4,8 +4,6 @@ docs/specifications/short-message.md specifies every byte. The vessel is not par
 it by the terminal that sent the message.
 """
 
-from __future__ import annotations
-
 import binascii
 import math
 import struct
@@ -120,7 +118,7 @@ class ShortMessage:
         return packed
 
     @classmethod
-    def unpack(cls, data: bytes, where: str = _WHERE) -> ShortMessage:
+    def unpack(cls, data: bytes, where: str = _WHERE) -> "ShortMessage":
         """Parse a message.
 
         Raises:
@@ -179,7 +177,7 @@ class ShortAcknowledgement:
         return _with_crc(_ACKNOWLEDGEMENT.pack(_ACKNOWLEDGEMENT_TYPE, self.epoch, self.base) + bitmap.rstrip(b"\0"))
 
     @classmethod
-    def unpack(cls, data: bytes, where: str = _WHERE) -> ShortAcknowledgement:
+    def unpack(cls, data: bytes, where: str = _WHERE) -> "ShortAcknowledgement":
         """Parse an acknowledgement.
 
         Raises:

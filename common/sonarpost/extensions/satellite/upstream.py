@@ -1,7 +1,5 @@
 """Upstream of the relay over a message bearer: contacts with previews and decisions in short messages."""
 
-from __future__ import annotations
-
 import logging
 import secrets
 import threading
@@ -57,7 +55,7 @@ class SatelliteUpstream(Bearer):
 
     KEYS = SatelliteKeys
 
-    def __init__(self, options: UpstreamOptions, service: Service[Any], *, has_radio: bool) -> None:
+    def __init__(self, options: "UpstreamOptions", service: Service[Any], *, has_radio: bool) -> None:
         self.site = options.site
         self._options = own = cast(SatelliteKeys, options)
         self._store = store = service.store

@@ -1,7 +1,5 @@
 """Simulation of what sonarpost needs at sea: modems, the acoustic channel, and side-scan surveys of the seabed."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from sonarpost.cli.parsing.commands import CommandSpec

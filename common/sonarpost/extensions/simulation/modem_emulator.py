@@ -1,7 +1,5 @@
 """`sonarpost modem-emulator`: emulated Micro-Modems and the channel between them, without a configuration file."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

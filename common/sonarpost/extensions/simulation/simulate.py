@@ -1,7 +1,5 @@
 """`sonarpost simulate`: write a simulated survey and its ground truth."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import asdict

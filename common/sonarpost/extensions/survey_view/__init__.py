@@ -1,7 +1,5 @@
 """`sonarpost survey view`: a local web page with the waterfall of a recording, for picks."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from sonarpost.cli.parsing.commands import CommandSpec

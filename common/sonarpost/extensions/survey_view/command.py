@@ -1,7 +1,5 @@
 """`sonarpost survey view FILE`: serve a page with the waterfall, its contacts, and picks by a click."""
 
-from __future__ import annotations
-
 import argparse
 import secrets
 import tempfile

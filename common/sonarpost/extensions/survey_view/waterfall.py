@@ -3,8 +3,6 @@
 Memory does not depend on the length of the recording. The disk space is about 2 kB a row.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

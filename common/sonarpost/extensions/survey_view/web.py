@@ -3,8 +3,6 @@
 Every path begins with a random token, so that other users and pages of this host cannot read it.
 """
 
-from __future__ import annotations
-
 import hmac
 import shlex
 import threading

@@ -1,7 +1,5 @@
 """`sonarpost c2 cot`: sends the contacts of a shore site to a TAK endpoint, live or once."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os

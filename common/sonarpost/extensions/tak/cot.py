@@ -5,8 +5,6 @@ return. A disputed contact counts as mine-like. The types correspond to the MIL-
 S*U-NB (bottom return, non-mine bottom object).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Mapping
 from typing import IO, Final

@@ -5,8 +5,6 @@ CoT has no acknowledgement. Therefore each batch has a connection of its own, wh
 replaces the first one. A datagram is never acknowledged.
 """
 
-from __future__ import annotations
-
 import os
 import socket
 import time

@@ -6,8 +6,6 @@ connection and reads on. A server that then closes its side without a reset has 
 connection that is closed with unread data. A server that closes first has stopped, or has refused the client.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

@@ -3,8 +3,6 @@
 A client that imports a package adds each event to its map and attaches the image to it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -4,8 +4,6 @@ A sealed contact looks like one of a vehicle until an operator has decided. Then
 Its decisions and requests are never sent: the watch answers the requests itself.
 """
 
-from __future__ import annotations
-
 import heapq
 import logging
 import random

@@ -1,7 +1,5 @@
 """`sonarpost console training`: a console with simulated contacts."""
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from contextlib import ExitStack, closing

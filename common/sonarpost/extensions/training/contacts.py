@@ -1,7 +1,5 @@
 """Simulated contacts for training: objects of a simulated survey, encoded with the real codecs."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Iterator
@@ -72,7 +70,7 @@ class SimulatedContact:
         """The object of the contact."""
         return Truth(self.target.is_mine_like, self.target.kind.value.replace("_", " "), sealed=False)
 
-    def expanded(self, image_id: str) -> SimulatedContact | None:
+    def expanded(self, image_id: str) -> "SimulatedContact | None":
         """Return an image of more seabed around the contact; None if this image is already expanded.
 
         Args:
@@ -93,7 +91,7 @@ class SimulatedContact:
             expanded_snippet=None,
         )
 
-    def unfiltered(self, image_id: str) -> SimulatedContact | None:
+    def unfiltered(self, image_id: str) -> "SimulatedContact | None":
         """Return an image of the contact without despeckling; None if this image is not despeckled.
 
         Args:
@@ -104,7 +102,7 @@ class SimulatedContact:
         codec = EmbCodec(strength=0.0)
         return replace(self, image_id=image_id, versions=_versions(codec, self.snippet, incomplete=False), codec=codec)
 
-    def region(self, image_id: str, box: RegionBox, stream_bytes: int) -> SimulatedContact:
+    def region(self, image_id: str, box: RegionBox, stream_bytes: int) -> "SimulatedContact":
         """Return an image of a part of the contact.
 
         Args:
@@ -118,7 +116,7 @@ class SimulatedContact:
         version = ImageVersion(len(stream), len(stream), 1, self.codec.decode(stream))
         return replace(self, image_id=image_id, versions=(version,), snippet=part, expanded_snippet=None)
 
-    def with_next_version(self, *, refine: bool) -> SimulatedContact:
+    def with_next_version(self, *, refine: bool) -> "SimulatedContact":
         """Return the contact with one more, complete version; with `refine`, of a stream of twice the length."""
         last = self.versions[-1]
         budget = None

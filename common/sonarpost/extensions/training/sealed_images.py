@@ -3,8 +3,6 @@
 Imported only where the calibrated watch is switched on: it loads the simulation and the detector.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields

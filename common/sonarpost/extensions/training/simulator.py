@@ -1,7 +1,5 @@
 """Simulator of the training console: contacts arrive, requests and decisions are delivered, all in this process."""
 
-from __future__ import annotations
-
 import random
 import sqlite3
 import threading

@@ -1,7 +1,5 @@
 """Configuration of the channel emulator service: the `[acoustic_channel]` table."""
 
-from __future__ import annotations
-
 from sonarpost.extensions.simulation.channel.config import EmulatorConfig
 
 

@@ -3,8 +3,6 @@
 The emulator, `sonarpost.extensions.simulation.channel.emulator.ChannelEmulator`, needs neither this process nor Zenoh.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 

@@ -4,8 +4,6 @@ SNR = SL - TL - NL - 10 log10(bandwidth), with straight rays at one sound speed.
 Multipath, Doppler and shadow zones are not modelled; see docs/explanation/channel-model.md.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -34,7 +32,7 @@ class LocalPosition:
     north_m: float = 0.0
     depth_m: float = 0.0
 
-    def range_m(self, other: LocalPosition) -> float:
+    def range_m(self, other: "LocalPosition") -> float:
         """Return the straight distance to `other` in metres."""
         return math.dist((self.east_m, self.north_m, self.depth_m), (other.east_m, other.north_m, other.depth_m))
 

@@ -4,8 +4,6 @@ One thread reads the clock, moves bytes between the ports and a `ChannelSimulato
 are made in the simulator, which needs neither clock nor port.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import os

@@ -1,7 +1,5 @@
 """Packets in the acoustic channel and what becomes of them at each receiver."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

@@ -4,8 +4,6 @@ Ports never block and have at most one client. Bytes written to a port may be lo
 reads them, as with a real serial line.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import select

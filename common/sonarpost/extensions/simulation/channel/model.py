@@ -5,8 +5,6 @@ sources are in docs/explanation/channel-model.md. Packet draws depend only on (s
 receiver, frame), fades only on (seed, path, time), so a run can be repeated.
 """
 
-from __future__ import annotations
-
 import hashlib
 import heapq
 import math

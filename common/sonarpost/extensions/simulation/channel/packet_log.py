@@ -15,8 +15,6 @@ frame also has `sent_hex`. `source`, `destination` and `receiver` are addresses;
 time at which the packet had passed the receiver.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -3,8 +3,6 @@
 docs/explanation/channel-model.md names the source of each parameter.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import tomllib

@@ -5,8 +5,6 @@ with the simulated time and writes the result of `take_outputs` to the hosts. Ev
 however late `advance` is called, so a slow owner changes no result.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field

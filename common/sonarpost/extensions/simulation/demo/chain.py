@@ -1,7 +1,5 @@
 """Starts, kills, restarts and stops the processes of a chain on one host."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import IO
@@ -26,7 +24,7 @@ class Chain(Processes):
         self.settings = settings
         self._logs: list[IO[bytes]] = []
 
-    def __enter__(self) -> Chain:
+    def __enter__(self) -> "Chain":
         write_config(self.settings)
         for folder in (self.settings.folder / "logs", self.settings.incoming, self.settings.channel_log.parent):
             folder.mkdir(parents=True, exist_ok=True)

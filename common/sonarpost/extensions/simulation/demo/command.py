@@ -1,7 +1,5 @@
 """The `sonarpost demo` command."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import importlib.util

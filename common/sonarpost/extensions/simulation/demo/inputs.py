@@ -1,7 +1,5 @@
 """Input of a demo: a simulated survey, survey files, or images of the user."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Outcome of a run: what the channel delivered compared with the images at the vessel and at the shore site."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections import Counter

@@ -1,7 +1,5 @@
 """What the demo shows at its end: the table, the summary, and the contact sheet."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Settings of a chain on one host, and the configuration files written from them."""
 
-from __future__ import annotations
-
 import json
 import socket
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """Observation of a running chain over Zenoh, as any subscriber can do it, and detection of its end."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time
@@ -66,7 +64,7 @@ class Watcher:
         self._lock = threading.Lock()
         self._sessions: list[zenoh.Session] = []
 
-    def __enter__(self) -> Watcher:
+    def __enter__(self) -> "Watcher":
         uuv, vessel, shore = (self._open(port) for port in self.settings.router_ports)
         self._subscribe(uuv, keys.contact_detected(UUV), Snippet, self._on_snippet)
         self._subscribe(uuv, keys.image_encoded(UUV), EncodedImage, self._on_encoded)

@@ -3,8 +3,6 @@
 The layouts are written down here independently of the driver's, so that an error in one of them is found by the other.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta

@@ -1,7 +1,5 @@
 """Emulated modems by the name of their driver. The group of entry points is `sonarpost.emulated_modems`."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import ClassVar, Final
 

@@ -20,8 +20,6 @@ Choices where hardware documents are silent, and on which hosts should not rely:
 - An invalid or unknown sentence is answered with `CAERR,hhmmss,NMEA,number,text`.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections import deque

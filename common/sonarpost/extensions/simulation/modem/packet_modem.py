@@ -5,8 +5,6 @@ transmission follows the other; a host that sends faster than the channel waits 
 given up after a pause, so that no bytes of a host make a modem silent.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass

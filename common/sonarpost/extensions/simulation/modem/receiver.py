@@ -5,8 +5,6 @@ packet of rate 0 and a poll begin with a cycle header, a packet of its own with 
 rate 0 then has no `CACYC`. Announced frames without data have no line.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from datetime import datetime
 

@@ -1,7 +1,5 @@
 """Configuration, stored settings and clock of the emulated modem."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -5,8 +5,6 @@ Goby misreads later ones. Version 8 of `CACST` adds four fields after the bandwi
 to it, adds the actual carrier. Levels are plausible and follow range and packet; they are not calibrated.
 """
 
-from __future__ import annotations
-
 import math
 from datetime import datetime
 from enum import IntEnum

@@ -5,8 +5,6 @@ cycle at rate 0, and a poll of another modem, transmit a header first. The modem
 or waits for the data of the other modem.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

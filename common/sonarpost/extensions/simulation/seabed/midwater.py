@@ -5,8 +5,6 @@ in part when the body is a school of fish. The near side of a solid body returns
 returns an echo in the ping nearest to it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Dimensions follow published ones of the classes used in mine hunting: a cylinder
 0.8 m, 0.38 m high), and the sphere of a moored mine (0.8 to 1.0 m) on the bottom or above its anchor.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """Variations of the receiver: surface return, crosstalk, error of the time-varied gain, gain steps."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Final

@@ -1,7 +1,5 @@
 """Scattering, vertical beam and sampling of the simulated echo."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

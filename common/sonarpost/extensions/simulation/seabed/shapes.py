@@ -1,7 +1,5 @@
 """Surfaces of the objects of the simulated seabed: height above the seabed and backscatter of their material."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

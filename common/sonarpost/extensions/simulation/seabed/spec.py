@@ -1,7 +1,5 @@
 """Specification of a simulated survey."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from sonarpost.errors import ConfigError

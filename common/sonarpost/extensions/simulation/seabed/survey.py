@@ -7,8 +7,6 @@ specular part, weighted by the vertical beam. Its energy is added to the sample 
 dark water column and the first bottom return follow from geometry.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Placing objects into a simulated seabed: height, backscatter, scour pit, and parts above the seabed."""
 
-from __future__ import annotations
-
 import math
 from typing import Final
 

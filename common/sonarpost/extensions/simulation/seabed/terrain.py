@@ -6,8 +6,6 @@ kilohertz of a side-scan sonar. The shapes follow recordings: power-law relief, 
 and fork, patches with soft borders, rock outcrops in sand.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """Writer of XTF recordings, for the simulator, for parts of surveys and for tests with other readers."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 from collections import Counter
