@@ -27,7 +27,7 @@ UserRole = Literal["observer", "operator", "expert"]
 ConsoleSide = Literal["vessel", "shore"]
 Permission = Literal["decide", "measure", "request", "comment"]
 Table = Literal["decision", "request", "comment"]
-"""Tables of the records that this console sends; their columns `payload` and `sent` hold what the outbox receives."""
+"""Tables of the records that this console sends."""
 
 ROLES: Final[tuple[UserRole, ...]] = ("observer", "operator", "expert")
 PERMISSIONS: Final[tuple[Permission, ...]] = ("decide", "measure", "request", "comment")
@@ -39,7 +39,7 @@ RECORD_TYPES: Final[dict[Table, type[Decision] | type[Command] | type[Comment]]]
 }
 
 DATABASE_NAME: Final = "console-review.db"
-SCHEMA_VERSION: Final = 1
+SCHEMA_VERSION: Final = 2
 
 CONTRADICTORY: Final = (
     "COALESCE(MAX(g.review = 'disputed') OR (MAX(g.review = 'mine_like') AND MAX(g.review = 'not_mine_like')), 0)"
@@ -92,12 +92,11 @@ CREATE TABLE IF NOT EXISTS version (
 CREATE TABLE IF NOT EXISTS decision (
     seq INTEGER PRIMARY KEY AUTOINCREMENT, decision_id TEXT NOT NULL UNIQUE, contact_id TEXT NOT NULL DEFAULT '',
     vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL, version INTEGER NOT NULL,
-    verdict TEXT NOT NULL, confidence REAL, mlo_class TEXT, remark TEXT NOT NULL, operator TEXT NOT NULL,
-    decided_utc_s REAL NOT NULL, sha256 TEXT, layer TEXT, undoes TEXT, undone INTEGER NOT NULL DEFAULT 0,
-    elsewhere INTEGER NOT NULL DEFAULT 0, shore TEXT NOT NULL, vehicle TEXT NOT NULL, reason TEXT NOT NULL DEFAULT '',
-    times_sent INTEGER NOT NULL DEFAULT 0, relayed_utc_s REAL, changed_utc_s REAL NOT NULL,
-    payload BLOB NOT NULL, sent INTEGER NOT NULL, send_after_utc_s REAL, overrules TEXT NOT NULL DEFAULT '[]',
-    shown_s REAL, bytes_received INTEGER, batch TEXT);
+    verdict TEXT NOT NULL, operator TEXT NOT NULL, decided_utc_s REAL NOT NULL, sha256 TEXT, layer TEXT, undoes TEXT,
+    undone INTEGER NOT NULL DEFAULT 0, elsewhere INTEGER NOT NULL DEFAULT 0, shore TEXT NOT NULL, vehicle TEXT NOT NULL,
+    reason TEXT NOT NULL DEFAULT '', times_sent INTEGER NOT NULL DEFAULT 0, relayed_utc_s REAL,
+    changed_utc_s REAL NOT NULL, payload BLOB NOT NULL, sent INTEGER NOT NULL, send_after_utc_s REAL, shown_s REAL,
+    bytes_received INTEGER, batch TEXT);
 CREATE INDEX IF NOT EXISTS decision_contact ON decision (contact_id, seq);
 CREATE INDEX IF NOT EXISTS decision_waiting ON decision (vessel_id, vehicle_id, image_id) WHERE contact_id = '';
 CREATE INDEX IF NOT EXISTS decision_unsent ON decision (seq) WHERE sent = 0;
@@ -116,10 +115,8 @@ CREATE INDEX IF NOT EXISTS request_contact ON request (contact_id, seq);
 CREATE INDEX IF NOT EXISTS request_unsent ON request (seq) WHERE sent = 0;
 CREATE TABLE IF NOT EXISTS comment (
     seq INTEGER PRIMARY KEY AUTOINCREMENT, comment_id TEXT NOT NULL UNIQUE, contact_id TEXT NOT NULL DEFAULT '',
-    vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL, version INTEGER NOT NULL,
-    verdict TEXT, confidence REAL, mlo_class TEXT, remark TEXT NOT NULL, author TEXT NOT NULL,
-    commented_utc_s REAL NOT NULL, state TEXT, reason TEXT NOT NULL DEFAULT '', payload BLOB NOT NULL,
-    sent INTEGER NOT NULL);
+    vessel_id TEXT NOT NULL, vehicle_id TEXT NOT NULL, image_id TEXT NOT NULL, state TEXT,
+    reason TEXT NOT NULL DEFAULT '', payload BLOB NOT NULL, sent INTEGER NOT NULL);
 CREATE INDEX IF NOT EXISTS comment_contact ON comment (contact_id, seq);
 CREATE INDEX IF NOT EXISTS comment_waiting ON comment (vessel_id, vehicle_id, image_id) WHERE contact_id = '';
 CREATE INDEX IF NOT EXISTS comment_unsent ON comment (seq) WHERE sent = 0;
@@ -155,7 +152,8 @@ CREATE TABLE IF NOT EXISTS look_pair (
     a TEXT NOT NULL, b TEXT NOT NULL, joined INTEGER NOT NULL, PRIMARY KEY (a, b)) WITHOUT ROWID;
 CREATE INDEX IF NOT EXISTS look_pair_b ON look_pair (b);
 """
-"""`contact.image`: newest version of the image with its contact, as in a side-car; columns repeat what queries use.
+"""`contact.image`: newest version of the image with its contact, as in a side-car; `payload` of a decision, request or
+comment: the record. Columns repeat what queries use.
 `object` only issues identifiers. `look_pair`: looks that a person joined or separated. `decision.batch` is common to
 the decisions that one verdict on an object made."""
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
@@ -29,6 +28,10 @@ from sonarpost.services.console.store.database import (
 )
 from sonarpost.services.console.store.requests import check_waiting, is_later_state
 from sonarpost.services.console.store.serialisers import Json, decode_image
+
+
+_COLUMNS: Final = "decision_id vessel_id vehicle_id image_id verdict operator decided_utc_s"
+"""Fields of a decision that have a column of their name."""
 
 
 class ConflictError(SonarpostError):
@@ -214,14 +217,19 @@ def last_own_decision(db: sqlite3.Connection, user: str, since_utc_s: float) -> 
 def list_notices(db: sqlite3.Connection, user: str) -> list[Json]:
     """Return the notices that a user has not acknowledged and that still apply, oldest first."""
     rows = db.execute(
-        "SELECT n.id, n.kind, n.contact_id, c.name, d.verdict AS own_verdict, b.operator, b.verdict, b.remark,"
-        " b.decided_utc_s FROM notice n JOIN contact c ON c.id = n.contact_id"
+        "SELECT n.id, n.kind, n.contact_id, c.name, d.verdict AS own_verdict, b.payload"
+        " FROM notice n JOIN contact c ON c.id = n.contact_id"
         " JOIN decision d ON d.decision_id = n.decision_id JOIN decision b ON b.decision_id = n.by_decision_id"
         " WHERE n.user = ? AND n.acknowledged_utc_s IS NULL AND b.undone = 0 AND d.undone = 0"
         " AND (n.kind = 'overruled' OR c.review = 'disputed') ORDER BY n.id",
         (user,),
     )
-    return [dict(row) for row in rows]
+    notices: list[Json] = []
+    for row in rows:
+        record = wire.decode(Decision, bytes(row["payload"]), f"notice {row['id']}")
+        notice = {name: row[name] for name in ("id", "kind", "contact_id", "name", "own_verdict")}
+        notices.append({**notice, **record.model_dump(include={"operator", "verdict", "remark", "decided_utc_s"})})
+    return notices
 
 
 def acknowledge_notice(db: sqlite3.Connection, notice_id: int, actor: Actor, now_utc_s: float) -> None:
@@ -368,8 +376,7 @@ def _insert(
 ) -> None:
     sent = received or {delivery.shore, delivery.vehicle} <= {"none", "disputed"}
     values: Json = {
-        **record.model_dump(exclude={"image_version", "withdraws", "overrules"}),
-        "overrules": json.dumps(record.overrules),
+        **{name: getattr(record, name) for name in _COLUMNS.split()},
         "contact_id": contact_id,
         "version": record.image_version,
         "sha256": displayed.sha256,

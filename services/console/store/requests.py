@@ -284,9 +284,8 @@ def check_waiting(db: sqlite3.Connection, record: Decision | Comment) -> None:
 
 def _insert_comment(db: sqlite3.Connection, contact_id: str, record: Comment, state: str | None) -> None:
     values: Json = {
-        **record.model_dump(exclude={"image_version"}),
+        **{name: getattr(record, name) for name in ("comment_id", "vessel_id", "vehicle_id", "image_id")},
         "contact_id": contact_id,
-        "version": record.image_version,
         "state": state,
         "payload": wire.encode(record),
         "sent": int(state is None),

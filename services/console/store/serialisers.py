@@ -10,7 +10,7 @@ from typing import Any, Final, Literal
 
 from sonarpost import wire
 from sonarpost.limits import limit
-from sonarpost.messages import ReconstructedImage
+from sonarpost.messages import Comment, Decision, ReconstructedImage
 from sonarpost.modem.interface import RateInfo
 from sonarpost.review.costs import airtime_of_frames, least_airtime_s
 from sonarpost.review.image_geometry import contact_box, contact_mark, range_axis
@@ -56,14 +56,11 @@ _CONTACT_COLUMNS: Final = (
 _IMAGE_FIELDS: Final = "bytes_total complete authenticated"
 _RECORD_FIELDS: Final = "atd_class atd_confidence p_mine_like p_other_object lat_deg lon_deg position_sigma_m"
 _DELIVERY_COLUMNS: Final = "shore vehicle reason times_sent changed_utc_s"
-_DECISION_COLUMNS: Final = (
-    "decision_id verdict confidence mlo_class remark operator decided_utc_s version sha256 layer undoes"
-)
 _REQUEST_COLUMNS: Final = (
     "command_id kind user asked_utc_s airtime_s state times_sent reason changed_utc_s bytes_wanted probable_utc_s"
     " expected_utc_s late_utc_s arrived_utc_s"
 )
-_COMMENT_COLUMNS: Final = "comment_id version verdict confidence mlo_class remark author commented_utc_s"
+_NAMED_BY_CONTACT: Final = {"vessel_id", "vehicle_id", "image_id"}
 _AUDIT_COLUMNS: Final = "seq utc_s user role address action version sha256 layer"
 _VERSION_FIELDS: Final = (
     "version codec model complete missing_fraction bytes_received bytes_total first_frame_utc_s authenticated"
@@ -112,11 +109,14 @@ def contact_json(row: sqlite3.Row) -> Json:
 
 
 def decision_json(row: sqlite3.Row) -> Json:
-    """Return a decision."""
+    """Return a decision with all fields of its record."""
+    record = wire.decode(Decision, bytes(row["payload"]), f"decision {row['decision_id']}")
     return {
-        **_select(row, _DECISION_COLUMNS),
+        "version": record.image_version,
+        "undoes": record.withdraws,
+        **record.model_dump(exclude={*_NAMED_BY_CONTACT, "image_version", "withdraws"}),
+        **_select(row, "sha256 layer"),
         "undone": bool(row["undone"]),
-        "overrules": json.loads(row["overrules"]),
         "take_back_utc_s": row["send_after_utc_s"],
         "elsewhere": bool(row["elsewhere"]),
         "delivery": _select(row, _DELIVERY_COLUMNS),
@@ -132,9 +132,11 @@ def request_json(row: sqlite3.Row) -> Json:
 
 
 def comment_json(row: sqlite3.Row) -> Json:
-    """Return a comment."""
+    """Return a comment with all fields of its record."""
+    record = wire.decode(Comment, bytes(row["payload"]), f"comment {row['comment_id']}")
+    fields = record.model_dump(exclude={*_NAMED_BY_CONTACT, "image_version"})
     delivery = None if row["state"] is None else {"state": row["state"], "reason": row["reason"]}
-    return {**_select(row, _COMMENT_COLUMNS), "delivery": delivery}
+    return {"version": record.image_version, **fields, "delivery": delivery}
 
 
 RECORD_JSON: Final[Mapping[Table, Callable[[sqlite3.Row], Json]]] = {

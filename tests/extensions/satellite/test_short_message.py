@@ -3,6 +3,7 @@
 import json
 import math
 
+import msgpack
 import pytest
 from builders.common import REPOSITORY
 from extensions.satellite.records import decision, golden, received, with_crc
@@ -70,6 +71,12 @@ def test_preview_ends_before_the_first_missing_byte():
     headless = image.model_copy(update={"missing": ((0, 80),)})
     again = unpack_contact(pack_contact(headless), "vessel-1")
     assert (again.stream, again.contact) == (b"", image.contact)
+
+
+def test_short_message_has_all_fields_of_a_decision():
+    values = decision("d9").model_dump(exclude={"vessel_id"})
+    packed = msgpack.unpackb(pack_decision(decision("d9")), use_list=False)
+    assert packed == tuple(values.values())
 
 
 @given(

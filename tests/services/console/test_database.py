@@ -11,7 +11,7 @@ from sonarpost.services.console.store.database import Database
 from sonarpost.services.console.store.users import Users
 
 
-@pytest.mark.parametrize(("opened", "found", "expected"), [(Database, 2, 1), (Users, 0, 1)])
+@pytest.mark.parametrize(("opened", "found", "expected"), [(Database, 1, 2), (Users, 0, 1)])
 def test_file_of_another_schema_version_is_refused_and_left_unchanged(opened, found, expected, tmp_path):
     path = tmp_path / "file.db"
     opened(path).close()

@@ -5,6 +5,7 @@ from builders.console import Clock, comment_record, contact_id, image_record
 from builders.records import decision_record
 from pydantic import ValidationError
 
+from sonarpost import wire
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Decision
 from sonarpost.services.console.config import ConsoleConfig
@@ -57,6 +58,22 @@ def test_record_that_cannot_be_decoded_delays_no_other(console, clock):
     console.state.config = console.state.config.model_copy(update={"max_bytes": 0})
     assert console.state.remove_images(clock.now_utc_s) == 2
     assert anna.get("/api/contacts").json()["total"] == 2
+
+
+def test_decision_is_stored_and_shown_with_all_fields_of_its_record(console, clock):
+    class LongerDecision(Decision):
+        further: str = "kept"
+
+    record = decision_record(image_id="00A7", image_version=1, overrules=("d-0",), withdraws="d-9", remark="a boulder")
+    assert console.state.store_decision(LongerDecision.model_validate(record.model_dump()))
+    with console.state.database.read() as db:
+        [stored] = db.execute("SELECT payload FROM decision").fetchone()
+    assert wire.decode(LongerDecision, stored, "decision") == LongerDecision.model_validate(record.model_dump())
+    [shown] = console.browser("anna").contact(ID)["decisions"]
+    shown |= {"image_version": shown["version"], "withdraws": shown["undoes"], "overrules": tuple(shown["overrules"])}
+    of_contact = {"vessel_id", "vehicle_id", "image_id"}
+    fields = record.model_dump(exclude=of_contact)
+    assert fields == {name: shown[name] for name in Decision.model_fields if name not in of_contact}
 
 
 def test_decisions_without_images_are_limited_for_each_vessel(console, clock, monkeypatch):
