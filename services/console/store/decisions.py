@@ -29,7 +29,6 @@ from sonarpost.services.console.store.database import (
 from sonarpost.services.console.store.requests import check_waiting, is_later_state
 from sonarpost.services.console.store.serialisers import Json, decode_image
 
-
 _COLUMNS: Final = "decision_id vessel_id vehicle_id image_id verdict operator decided_utc_s"
 """Fields of a decision that have a column of their name."""
 
