@@ -9,19 +9,29 @@ The column `contact.sealed` is 1 for a sealed contact, and 2 after its object wa
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import statistics
 from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Final
+from itertools import pairwise
+from typing import Any, Final
 
-from sonarpost.review.scoring import ScoredDecision, score, score_by_bytes
 from sonarpost.services.console.store.association import isolate_look
 from sonarpost.services.console.store.database import insert_row
 from sonarpost.services.console.store.serialisers import Json
 
 MAX_LISTED: Final = 500
 """Contacts in the list of a score sheet: the most recently decided ones."""
+
+BYTE_LIMITS: Final = (32, 64, 128, 256, 512)
+"""Upper limits of the groups of decisions by received bytes; the last group has no limit."""
+_Z_95: Final = 1.959963984540054
+"""Quantile of the standard normal distribution for an interval of 95 %."""
+
+_Decision = Mapping[str, Any]
+"""A row of `_SCORED`."""
 
 _SCORED: Final = """
 SELECT d.contact_id, d.operator, d.verdict, d.shown_s, d.decided_utc_s, d.bytes_received, c.name, t.is_mine_like,
@@ -103,20 +113,72 @@ def score_sheet(db: sqlite3.Connection, operator: str | None, now_utc_s: float, 
         now_utc_s: Current time.
         take_back_s: Time in which an operator can take a decision back.
     """
-    rows = db.execute(_SCORED, (now_utc_s - take_back_s,)).fetchall()
+    rows = [dict(row) for row in db.execute(_SCORED, (now_utc_s - take_back_s,))]
     if operator is not None:
         rows = [row for row in rows if row["operator"] == operator]
     operators: list[Json] = []
     for name in sorted({row["operator"] for row in rows}):
-        decisions = [_scored(row) for row in rows if row["operator"] == name]
-        groups = [
-            {"above_bytes": low, "up_to_bytes": high, **asdict(one)} for low, high, one in score_by_bytes(decisions)
-        ]
-        operators.append({"operator": name, **asdict(score(decisions)), "by_bytes": groups})
+        decisions = [row for row in rows if row["operator"] == name]
+        operators.append({"operator": name, **score(decisions), "by_bytes": score_by_bytes(decisions)})
+    names = ("contact_id", "name", "operator", "verdict", "label", "bytes_received", "shown_s", "decided_utc_s")
     return {
         "operators": operators,
-        "decisions": [_decided_json(row) for row in rows[:MAX_LISTED]],
+        "decisions": [
+            {**{name: row[name] for name in names}, "is_mine_like": bool(row["is_mine_like"])}
+            for row in rows[:MAX_LISTED]
+        ],
         "watch": _decisions_by_operator(db),
+    }
+
+
+def score(decisions: Sequence[_Decision]) -> Json:
+    """Return the score of a set of decisions: probability of detection, false alarms, medians of time and bytes.
+
+    `detected`: mine-like objects with the verdict mine-like; `false_alarms`: other objects with it. A median is None
+    without a value.
+    """
+    verdicts: dict[bool, list[str]] = {True: [], False: []}
+    for one in decisions:
+        verdicts[bool(one["is_mine_like"])].append(one["verdict"])
+    shown_s = [one["shown_s"] for one in decisions if one["shown_s"] is not None]
+    return {
+        "decided": len(decisions),
+        "detected": wilson_share(verdicts[True].count("mine_like"), len(verdicts[True])),
+        "false_alarms": wilson_share(verdicts[False].count("mine_like"), len(verdicts[False])),
+        "unsure": sum(one["verdict"] == "unsure" for one in decisions),
+        "median_shown_s": statistics.median(shown_s) if shown_s else None,
+        "median_bytes": statistics.median(one["bytes_received"] for one in decisions) if decisions else None,
+    }
+
+
+def score_by_bytes(decisions: Sequence[_Decision]) -> list[Json]:
+    """Return the score of each group of `BYTE_LIMITS` with decisions; its upper limit is inclusive, None for none."""
+    found: list[Json] = []
+    for low, high in pairwise((0, *BYTE_LIMITS, None)):
+        group = [one for one in decisions if (low or 0) < one["bytes_received"] <= (high or math.inf)]
+        if group:
+            found.append({"above_bytes": low, "up_to_bytes": high, **score(group)})
+    return found
+
+
+def wilson_share(count: int, total: int) -> Json:
+    """Return a share with its score interval of Wilson (1927), 95 %; None for all three without a case.
+
+    Args:
+        count: Number of cases with the property, 0 to `total`.
+        total: Number of cases.
+    """
+    if total == 0:
+        return {"count": count, "total": total, "share": None, "low": None, "high": None}
+    share, z2 = count / total, _Z_95**2
+    centre = (share + z2 / (2 * total)) / (1 + z2 / total)
+    half = _Z_95 / (1 + z2 / total) * math.sqrt(share * (1 - share) / total + z2 / (4 * total**2))
+    return {
+        "count": count,
+        "total": total,
+        "share": share,
+        "low": max(0.0, centre - half),
+        "high": min(1.0, centre + half),
     }
 
 
@@ -146,13 +208,3 @@ def _decisions_by_operator(db: sqlite3.Connection) -> list[Json]:
         }
         for operator, of_contacts in sorted(latest.items())
     ]
-
-
-def _scored(row: sqlite3.Row) -> ScoredDecision:
-    is_mine_like = bool(row["is_mine_like"])
-    return ScoredDecision(row["operator"], row["verdict"], is_mine_like, row["bytes_received"], row["shown_s"])
-
-
-def _decided_json(row: sqlite3.Row) -> Json:
-    names = ("contact_id", "name", "operator", "verdict", "label", "bytes_received", "shown_s", "decided_utc_s")
-    return {**{name: row[name] for name in names}, "is_mine_like": bool(row["is_mine_like"])}

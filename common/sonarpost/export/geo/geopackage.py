@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import IO, Final
 
 from sonarpost.export.contacts import ExportContact
-from sonarpost.export.geo.geometry import GeoPoint
 from sonarpost.export.geo.kml import COLOURS
 from sonarpost.export.source import ExportSource
 from sonarpost.export.tables import COLUMNS, Value, contact_properties
@@ -144,8 +143,10 @@ class Layer:
         db.execute(_CONTENTS, (name, "features", name, "", *(None,) * 4, 4326))
         db.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, 4326, 0, 0)", (name, geometry))
 
-    def add(self, geometry: bytes | None, points: Iterable[GeoPoint], values: Iterable[Value | bytes]) -> None:
-        """Add a feature: its geometry, the points of it, and the values of the other columns."""
+    def add(
+        self, geometry: bytes | None, points: Iterable[tuple[float, float]], values: Iterable[Value | bytes]
+    ) -> None:
+        """Add a feature: its geometry, the points of it (longitude, latitude), and the values of the other columns."""
         for lon_deg, lat_deg in points:
             west, south, east, north = self._box or (lon_deg, lat_deg) * 2
             self._box = min(west, lon_deg), min(south, lat_deg), max(east, lon_deg), max(north, lat_deg)

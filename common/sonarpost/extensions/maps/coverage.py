@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.export.geo.geometry import GeoPoint, geojson_geometry, split_ring
 from sonarpost.export.geo.geopackage import Layer, new_geopackage
 from sonarpost.export.text import utc_text
+from sonarpost.extensions.maps.geometry import GeoPoint, geojson_geometry, split_ring
 from sonarpost.extensions.maps.track import Track, far_m, first_position, is_gap, no_positions, tracks, utm_epsg
 from sonarpost.files import atomic_file, write_atomically
 from sonarpost.sonar.geometry import Position

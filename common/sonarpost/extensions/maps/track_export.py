@@ -20,7 +20,7 @@ from sonarpost.cli.shared import (
     utc_text,
 )
 from sonarpost.errors import SurveyFileError
-from sonarpost.export.geo.geometry import geojson_geometry
+from sonarpost.extensions.maps.geometry import geojson_geometry
 from sonarpost.files import atomic_file
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.source import SurveySource

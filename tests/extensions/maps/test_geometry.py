@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sonarpost.export.geo.geometry import split_line, split_ring
+from sonarpost.extensions.maps.geometry import split_line, split_ring
 
 QUARTERS = st.integers(-8, 8).map(lambda number: number / 4)
 """Degrees from the meridian or the equator; many are exactly 0."""
