@@ -362,6 +362,20 @@ class ConsoleState:
         shore, vehicle = ("waiting" if name in consumers else "none" for name in ("relay", "op_modem"))
         return DeliveryStates(shore, vehicle, self.config.take_back_s)
 
+    def reveal(self) -> None:
+        """Reveal the objects of contacts whose decision can no longer be taken back."""
+        with self.database.read() as db:
+            if not known_truth.has_unrevealed(db):
+                return
+        with self.database.transaction() as db:
+            known_truth.reveal(db, self.clock(), self.config.take_back_s)
+
+    def score_sheet(self, actor: Actor) -> Json:
+        """Return the scores that a user may see: experts those of all operators, others their own."""
+        operator = None if actor.role == "expert" else actor.user
+        with self.database.read() as db:
+            return known_truth.score_sheet(db, operator, self.clock(), self.config.take_back_s)
+
     def add_request(
         self,
         contact_id: str,

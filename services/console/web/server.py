@@ -31,7 +31,6 @@ from sonarpost.errors import ConfigError, PortError
 from sonarpost.logs import kv
 from sonarpost.network.connections import ConnectionLimits, LimitedListener, TrustedProxies
 from sonarpost.services.console.chain import SERVICE_STALE_S
-from sonarpost.services.console.known_objects import KnownObjects
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.users import MAX_PASSWORD, MIN_PASSWORD, Users
 from sonarpost.services.console.web.access import (
@@ -72,7 +71,6 @@ class ConsoleApp:
         self._stream = EventStream(state)
         access = AccessControl(users, config.role, TrustedProxies(config.trusted_proxies))
         sessions = SessionRoutes(users, config.role, tls=config.tls, max_age_s=config.session_max_s)
-        known = KnownObjects(state)
         routes = [
             Route("/api/info", access.endpoint(self._info)),
             *sessions.routes(access),
@@ -81,7 +79,7 @@ class ConsoleApp:
             *DecisionRoutes(state).routes(access),
             *ObjectRoutes(state).routes(access),
             *self._map.routes(access),
-            Route("/api/score", access.endpoint(lambda call: JSONResponse(known.score_sheet(call.actor)))),
+            Route("/api/score", access.endpoint(lambda call: JSONResponse(state.score_sheet(call.actor)))),
             *self._exports.routes(access),
             *ReportRoutes(state, self._exports, training=training).routes(access),
             *self._stream.routes(access),

@@ -7,7 +7,6 @@ import zipfile
 import pytest
 from builders.console import FIRST_UTC_S, Clock, contact_ids, image_record
 
-from sonarpost.services.console.known_objects import KnownObjects
 from sonarpost.services.console.store.truth import Truth
 
 MINE = Truth(is_mine_like=True, label="cylinder", sealed=True)
@@ -92,35 +91,35 @@ def test_nothing_shows_which_contacts_are_sealed_before_their_decision(make_cons
         anna, contact_id = console.browser("anna"), contact_ids(console.state)["00B1"]
         assert anna.decide(contact_id).status_code == 201
         clock.advance(console.state.config.take_back_s - 1.0)
-        KnownObjects(console.state).reveal()
+        console.state.reveal()
         assert console.state.unsent_records() == []
     assert outputs(consoles[0], user) == outputs(consoles[1], user)
     for console, clock in zip(consoles, clocks, strict=True):
         decision = console.browser("anna").get("/api/decisions/last").json()["decision"]
         assert console.browser("anna").undo(contact_ids(console.state)["00B1"], decision["decision_id"]).is_success
         clock.advance(60.0)
-        KnownObjects(console.state).reveal()
+        console.state.reveal()
         assert console.state.unsent_records() == []
     assert outputs(consoles[0], user) == outputs(consoles[1], user)
 
 
 def test_object_is_revealed_after_the_take_back_time(console, clock):
     contact_id = add(console, "00A7", MINE)
-    anna, known = console.browser("anna"), KnownObjects(console.state)
+    anna = console.browser("anna")
     assert anna.decide(contact_id).status_code == 201
     clock.now_utc_s += console.state.config.take_back_s - 0.1
-    known.reveal()
+    console.state.reveal()
     assert anna.contact(contact_id)["truth"] is None
     assert anna.get("/api/score").json()["operators"] == []
     clock.now_utc_s += 0.2
     last = console.state.events.last
-    known.reveal()
+    console.state.reveal()
     assert anna.contact(contact_id)["truth"] == {"is_mine_like": True, "label": "cylinder", "sealed": True}
     assert [event.name for event in console.state.events.events_after(last)] == ["contact"]
     assert set(contact_ids(console.state)) == set()
     assert console.state.counts().total == 0
     last = console.state.events.last
-    known.reveal()
+    console.state.reveal()
     assert console.state.events.last == last
 
 
@@ -131,7 +130,7 @@ def test_decision_that_was_taken_back_reveals_nothing(console, clock):
     clock.now_utc_s += 2.0
     assert anna.post(f"/api/contacts/{contact_id}/undo", {"decision_id": decision["decision_id"]}).status_code == 201
     clock.now_utc_s += 60.0
-    KnownObjects(console.state).reveal()
+    console.state.reveal()
     assert anna.contact(contact_id)["truth"] is None
     assert anna.get("/api/score").json()["operators"] == []
 
@@ -157,7 +156,7 @@ def test_score_by_operator_and_bytes(console, clock):
     bo.decide(mine, verdict="not_mine_like", shown_s=6.0)
     anna.decide(rock, verdict="mine_like", shown_s=2.0)
     clock.now_utc_s += 10.0
-    KnownObjects(console.state).reveal()
+    console.state.reveal()
     clock.now_utc_s += 10.0
     # A decision after the reveal does not count.
     bo.decide(rock, verdict="not_mine_like")
@@ -183,7 +182,7 @@ def test_score_counts_no_withdrawn_decision(console, clock):
     anna.decide(ids[0], verdict="not_mine_like")
     anna.decide(ids[1], verdict="unsure")
     clock.now_utc_s += 20.0
-    KnownObjects(console.state).reveal()
+    console.state.reveal()
     wrong = anna.contact(ids[0])["decisions"][0]["decision_id"]
     assert anna.undo(ids[0], wrong).status_code == 201
     # A verdict after the object was shown does not replace it.

@@ -5,7 +5,6 @@ import time
 
 from builders.console import comment_record, image_record
 
-from sonarpost.services.console.known_objects import KnownObjects
 from sonarpost.services.console.store.truth import Truth
 
 
@@ -17,7 +16,7 @@ def reveal(served):
     """End the take-back time of all decisions, and reveal objects."""
     now = served.state.clock()
     served.state.clock = lambda: now + 60.0
-    KnownObjects(served.state).reveal()
+    served.state.reveal()
 
 
 def test_object_is_shown_after_the_decision_and_counted_in_the_score(serve):

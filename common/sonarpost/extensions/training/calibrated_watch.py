@@ -7,6 +7,7 @@ Its decisions and requests are never sent: the watch answers the requests itself
 import heapq
 import logging
 import random
+import sqlite3
 import threading
 import time
 from collections.abc import Callable
@@ -23,9 +24,10 @@ from sonarpost.logs import kv
 from sonarpost.messages import Contact, ReconstructedImage
 from sonarpost.review.objects import Look, looks_within_gate
 from sonarpost.review.positions import destination, vehicle_position
-from sonarpost.services.console.known_objects import KnownObjects, SealedRequest
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.association import looks_near
+from sonarpost.services.console.store.contacts import find_contact
+from sonarpost.services.console.store.requests import update_request_state
 from sonarpost.services.console.store.truth import Truth
 from sonarpost.sonar.survey import Side
 
@@ -43,6 +45,12 @@ ACCEPTED_S: Final = 2.0
 """Time until a request is shown as sent."""
 UNANSWERED_AIRTIME_S: Final = 30.0
 """Time until the answer to a request whose cost is unknown."""
+
+_OPEN_REQUESTS: Final = (
+    "SELECT r.* FROM request r JOIN truth t ON t.contact_id = r.contact_id"
+    " WHERE t.sealed = 1 AND r.state IN ('waiting', 'asked', 'sent') ORDER BY r.seq"
+)
+"""SQL: the requests for sealed contacts that have no answer."""
 
 
 class CalibratedWatch:
@@ -63,7 +71,6 @@ class CalibratedWatch:
         count: Callable[[], object] = lambda: None,
     ) -> None:
         self._state = state
-        self._known = KnownObjects(state)
         self._share = share
         self._draws = random.SystemRandom() if draws is None else draws
         self._count = count
@@ -109,9 +116,11 @@ class CalibratedWatch:
                     break
                 _, _, reference = heapq.heappop(self._waiting)
             self._add(reference)
-        for request in self._known.sealed_requests():
+        with self._state.database.read() as db:
+            requests = db.execute(_OPEN_REQUESTS).fetchall()
+        for request in requests:
             self._answer(request)
-        self._known.reveal()
+        self._state.reveal()
 
     def _add(self, reference: ReconstructedImage) -> None:
         # The images of a survey have the pixel size of their reference, which may change between vehicles.
@@ -157,16 +166,22 @@ class CalibratedWatch:
         bearing_deg = heading_deg + (90.0 if known.detection.side is Side.STARBOARD else -90.0)
         return destination(lat, lon, bearing_deg, known.detection.ground_range_m or 0.0)
 
-    def _answer(self, request: SealedRequest) -> None:
+    def _answer(self, request: sqlite3.Row) -> None:
         """Advance a request as vehicle and link would."""
-        limit_s = UNANSWERED_AIRTIME_S if request.airtime_s is None else request.airtime_s
-        if request.age_s < ACCEPTED_S:
+        contact_id, now_utc_s = str(request["contact_id"]), self._state.clock()
+        age_s = now_utc_s - request["asked_utc_s"]
+        limit_s = UNANSWERED_AIRTIME_S if request["airtime_s"] is None else request["airtime_s"]
+        if age_s < ACCEPTED_S:
             return
-        self._known.advance_request(request, "sent" if request.age_s < limit_s else "confirmed")
-        snippet = self._snippets.get(request.contact_id)
-        if request.age_s < limit_s or request.kind != "refine" or snippet is None:
+        with self._state.database.transaction() as db:
+            update_request_state(
+                db, request["command_id"], "sent" if age_s < limit_s else "confirmed", "", 1, now_utc_s
+            )
+            version = find_contact(db, contact_id)["version"]
+        snippet = self._snippets.get(contact_id)
+        if age_s < limit_s or request["kind"] != "refine" or snippet is None:
             return
-        newest = self._known.newest_image(request.contact_id)
+        newest = self._state.image(contact_id, version)
         total = 2 * newest.bytes_total
-        refined = sealed_images.next_version(newest, snippet, newest.version + 1, total, total, self._state.clock())
+        refined = sealed_images.next_version(newest, snippet, newest.version + 1, total, total, now_utc_s)
         self._state.store_image(refined)

@@ -33,7 +33,6 @@ from sonarpost.modem.registry import modem_driver
 from sonarpost.review.costs import NEW_IMAGE_KINDS
 from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.fleet import DETECTOR
-from sonarpost.services.console.known_objects import KnownObjects
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.truth import Truth
 
@@ -80,7 +79,6 @@ class TrainingSimulator:
 
     def __init__(self, state: ConsoleState, contacts: int, seed: int = 1, interval_s: float = 6.0) -> None:
         self._state = state
-        self._known = KnownObjects(state)
         self._max_contacts = contacts
         self._interval_s = interval_s
         self._seed = seed
@@ -199,7 +197,7 @@ class TrainingSimulator:
             self._update_health(time.time())
             self.accept_records(time.time())
             self.advance_downlink(time.time())
-            self._known.reveal()
+            self._state.reveal()
             self._state.events.publish("fleet", self._state.fleet_state())
 
     # Uplink
