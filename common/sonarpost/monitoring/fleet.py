@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -261,26 +261,17 @@ class FleetWatcher:
             return
         # A session that is not closed would keep the process from exiting.
         with session:
-            session.declare_subscriber(keys.health_everywhere(), self._on_health)
-            for key in (keys.acoustic_status_everywhere(), keys.shore_status_everywhere()):
-                session.declare_subscriber(key, self._on_status)
-            session.declare_subscriber(keys.acoustic_range_everywhere(), self._on_range)
+            for key, add in (
+                (keys.health_everywhere(), self.fleet.add),
+                (keys.acoustic_status_everywhere(), self.fleet.add_status),
+                (keys.shore_status_everywhere(), self.fleet.add_status),
+                (keys.acoustic_range_everywhere(), self.fleet.add_range),
+            ):
+                session.declare_subscriber(key, partial(_add_sample, add))
             while True:
                 self._poll(session)
                 if self._stop.wait(self._poll_s):
                     return
-
-    def _on_health(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
-            self.fleet.add(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic())
-
-    def _on_status(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
-            self.fleet.add_status(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic())
-
-    def _on_range(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
-            self.fleet.add_range(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic())
 
     def _poll(self, session: zenoh.Session) -> None:
         """Query the tokens; this also finds tokens that ended during a link cut."""
@@ -293,3 +284,8 @@ class FleetWatcher:
             log.warning("Liveliness tokens not received", extra=kv(error=str(error)))
             tokens = None
         self.fleet.set_alive(tokens, time.monotonic(), lost_reason(session))
+
+
+def _add_sample(add: Callable[[str, bytes, float], None], sample: zenoh.Sample) -> None:
+    if sample.kind == zenoh.SampleKind.PUT:
+        add(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic())

@@ -12,7 +12,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Final, Literal, NamedTuple
+from functools import partial
+from itertools import product
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +22,7 @@ import numpy.typing as npt
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Contact, ReconstructedImage
 from sonarpost.review.highlight_ends import Point, snapped_ends
-from sonarpost.review.image_geometry import contact_mark, mark_sigma_m, range_axis, slant_range_m
+from sonarpost.review.image_geometry import Mark, contact_mark, mark_sigma_m, range_axis, slant_range_m
 from sonarpost.review.rendering import eight_bits
 from sonarpost.review.resolution import CODEBOOK_CODECS, FULL_WIDTH, blur_px, codebook_edge_px
 
@@ -121,23 +123,6 @@ class Length:
     missing_fraction: float
 
 
-@dataclass(frozen=True, slots=True)
-class Height:
-    """Height of an object above a flat seabed.
-
-    Attributes:
-        height_m: shadow x altitude / (slant range + shadow).
-        sigma_m: Its standard deviation.
-        altitude_m: Altitude of the vehicle.
-        slant_range_m: Slant range to the object.
-    """
-
-    height_m: float
-    sigma_m: float
-    altitude_m: float
-    slant_range_m: float
-
-
 def measure_line(image: ReconstructedImage, line: Line, beam_width_deg: float) -> dict[str, object]:
     """Measure a line on an image; return the fields of a measurement of the console's HTTP interface.
 
@@ -166,7 +151,8 @@ def measure_line(image: ReconstructedImage, line: Line, beam_width_deg: float) -
         sigma_px = math.hypot(SHADOW_SIGMA_PX, tile_px / math.sqrt(3.0))
         length = measure_length(contact, missing, line.start, end, (sigma_px, sigma_px), to_ground=False)
         length = _with_shadow_blur(length, contact, codec_px)
-        return {**_body(line, line.start, end, (True, True), length), **_height(contact, length)}
+        height = {} if contact is None else height_from_shadow(contact, length)
+        return {**_body(line, line.start, end, (True, True), length), **height}
     # The line as it was drawn is checked first.
     measure_length(contact, missing, line.start, line.end)
     places = snapped_ends(eight_bits(image.pixels.to_array()), missing, line.start, line.end)
@@ -193,15 +179,6 @@ def _body(line: Line, start: Point, end: Point, snapped: tuple[bool, bool], leng
         "height_sigma_m": None,
         "height_inputs": None,
     }
-
-
-def _height(contact: Contact | None, shadow: Length) -> dict[str, object]:
-    """Return the fields of the height; empty if altitude or range is unknown."""
-    height = None if contact is None else height_from_shadow(contact, shadow)
-    if height is None:
-        return {}
-    inputs = {"shadow_m": shadow.value_m, "altitude_m": height.altitude_m, "slant_range_m": height.slant_range_m}
-    return {"height_m": height.height_m, "height_sigma_m": height.sigma_m, "height_inputs": inputs}
 
 
 def _without_blur(length: Length, contact: Contact | None, columns: float, codec_px: float, beam_deg: float) -> Length:
@@ -293,24 +270,22 @@ def measure_length(
         got = f"{missing_fraction:.0%} not received"
         raise NotMeasurableError("image", "line", got, "a line over received pixels only")
     line = _Line(start, end, altitude_m=contact.altitude_m or 0.0)
-    recorded = _recorded(contact.pixel_along_m, contact.pixel_across_m)
+    pixel_m = contact.pixel_along_m, contact.pixel_across_m
+    recorded: _Components = partial(_components, pixel_m, None)
     components, range_sigma_m, metres = recorded, 0.0, range_axis(contact) or "unknown"
-    across_m = abs(recorded(line)[1])
-    value_m = math.hypot(*recorded(line))
-    ground = _ground(contact, missing.shape, start, end)
-    if to_ground and metres == "slant" and ground is not None:
-        components, metres = ground.components, "ground"
+    mark = _mark_on_ground(contact, missing.shape, start, end)
+    if mark is not None and to_ground and metres == "slant":
+        components, metres = partial(_components, pixel_m, mark), "ground"
         range_sigma_m = math.hypot(
             _change(components, line, line._replace(altitude_m=line.altitude_m + ALTITUDE_SIGMA_M)),
-            _change(components, line, line._replace(range_offset_m=ground.range_sigma_m)),
+            _change(components, line, line._replace(range_offset_m=mark_sigma_m(contact, mark))),
         )
     elif to_ground and metres != "ground":
         # Not converted: the difference to the ground, or that of a typical grazing angle.
-        known = ground is not None and metres == "unknown"
-        difference_m = (
-            abs(abs(ground.components(line)[1]) - across_m) if known and ground else UNCONVERTED_SIGMA * across_m
-        )
-        range_sigma_m = across_m / value_m * difference_m
+        across_m, difference_m = abs(recorded(line)[1]), UNCONVERTED_SIGMA * abs(recorded(line)[1])
+        if mark is not None and metres == "unknown":
+            difference_m = abs(abs(_components(pixel_m, mark, line)[1]) - across_m)
+        range_sigma_m = across_m / math.hypot(*recorded(line)) * difference_m
     along_m, across_m = components(line)
     value_m = math.hypot(along_m, across_m)
     sigmas = (
@@ -325,43 +300,26 @@ def measure_length(
 _Components = Callable[[_Line], tuple[float, float]]
 
 
-class _Ground(NamedTuple):
-    """Conversion of a line to metres on the seabed, with the standard deviation of the range of its columns."""
-
-    components: _Components
-    range_sigma_m: float
-
-
-def _recorded(pixel_along_m: float, pixel_across_m: float) -> _Components:
-    """Return the function from a line to its components (along, across) in the metres of the image."""
-
-    def components(line: _Line) -> tuple[float, float]:
-        (row, column), (end_row, end_column) = line.start, line.end
-        along_m = line.scale * (end_row - row) * pixel_along_m
-        return along_m, line.scale * (end_column - column) * pixel_across_m
-
-    return components
+def _components(pixel_m: tuple[float, float], mark: Mark | None, line: _Line) -> tuple[float, float]:
+    """Return the components (along, across) of a line in metres: on the seabed, without a mark those of the image."""
+    along_m = line.scale * (line.end[0] - line.start[0]) * pixel_m[0]
+    if mark is None:
+        return along_m, line.scale * (line.end[1] - line.start[1]) * pixel_m[1]
+    start_m, end_m = (
+        mark.range_m + line.range_offset_m + line.scale * (column - mark.column) * pixel_m[1]
+        for _, column in (line.start, line.end)
+    )
+    start_m, end_m = (math.sqrt(max(0.0, slant_m**2 - line.altitude_m**2)) for slant_m in (start_m, end_m))
+    return along_m, end_m - start_m
 
 
-def _ground(contact: Contact, shape: tuple[int, ...], start: Point, end: Point) -> _Ground | None:
-    """Return the conversion from slant to ground range; None if an input is unknown, or for the water column."""
+def _mark_on_ground(contact: Contact, shape: tuple[int, ...], start: Point, end: Point) -> Mark | None:
+    """Return the mark, from which slant is converted to ground range; None if unknown, or for the water column."""
     mark = contact_mark(contact, *shape)
-    along_m, across_m, altitude_m = contact.pixel_along_m, contact.pixel_across_m, contact.altitude_m
-    if mark is None or along_m is None or across_m is None or altitude_m is None:
+    if mark is None or contact.pixel_across_m is None or contact.altitude_m is None:
         return None
-    place, recorded = mark, _recorded(along_m, across_m)
-    nearest_m = place.range_m + (min(start[1], end[1]) - place.column) * across_m
-    if nearest_m < NADIR_LIMIT * (altitude_m + ALTITUDE_SIGMA_M):
-        return None
-
-    def ground_m(line: _Line, column: float) -> float:
-        slant_m = place.range_m + line.range_offset_m + line.scale * (column - place.column) * across_m
-        return math.sqrt(max(0.0, slant_m**2 - line.altitude_m**2))
-
-    def components(line: _Line) -> tuple[float, float]:
-        return recorded(line)[0], ground_m(line, line.end[1]) - ground_m(line, line.start[1])
-
-    return _Ground(components, mark_sigma_m(contact, place))
+    nearest_m = mark.range_m + (min(start[1], end[1]) - mark.column) * contact.pixel_across_m
+    return None if nearest_m < NADIR_LIMIT * (contact.altitude_m + ALTITUDE_SIGMA_M) else mark
 
 
 def _change(components: _Components, line: _Line, changed: _Line) -> float:
@@ -374,25 +332,18 @@ def _edge_sigma(components: _Components, line: _Line, sigmas_px: tuple[float, fl
     total = 0.0
     vector = components(line)
     length_m = math.hypot(*vector)
-    for axis, (rows, columns) in enumerate(((0.5, 0.0), (0.0, 0.5))):
-        for sigma_px, ahead, behind in (
-            (
-                sigmas_px[0],
-                line._replace(start=_moved(line.start, rows, columns)),
-                line._replace(start=_moved(line.start, -rows, -columns)),
-            ),
-            (
-                sigmas_px[1],
-                line._replace(end=_moved(line.end, rows, columns)),
-                line._replace(end=_moved(line.end, -rows, -columns)),
-            ),
-        ):
-            total += (sigma_px * vector[axis] / length_m * (components(ahead)[axis] - components(behind)[axis])) ** 2
+    for axis, name in product((0, 1), ("start", "end")):
+        change = components(_moved(line, name, axis, 0.5))[axis] - components(_moved(line, name, axis, -0.5))[axis]
+        total += (sigmas_px[name == "end"] * vector[axis] / length_m * change) ** 2
     return math.sqrt(total)
 
 
-def _moved(point: Point, rows: float, columns: float) -> Point:
-    return point[0] + rows, point[1] + columns
+def _moved(line: _Line, name: str, axis: int, step_px: float) -> _Line:
+    """Return a line whose `start` or `end` is moved along the rows (axis 0) or the columns."""
+    point = list(getattr(line, name))
+    point[axis] += step_px
+    changes: dict[str, Any] = {name: (point[0], point[1])}
+    return line._replace(**changes)
 
 
 def _fraction_on(mask: npt.NDArray[np.bool_], start: Point, end: Point) -> float:
@@ -403,17 +354,17 @@ def _fraction_on(mask: npt.NDArray[np.bool_], start: Point, end: Point) -> float
     return float(mask[rows, columns].mean())
 
 
-def height_from_shadow(contact: Contact, shadow: Length) -> Height | None:
-    """Return the height of an object from the length of its shadow; None if altitude or range is unknown.
+def height_from_shadow(contact: Contact, shadow: Length) -> dict[str, object]:
+    """Return the fields of the height of an object in a measurement; empty if altitude or range is unknown.
 
     Height over shadow equals altitude over the range of the shadow's end, all in slant range: the ray over the top of
-    the object meets the seabed there. If the contact record has only the ground range, the slant range is the
+    the object meets the flat seabed there. If the contact record has only the ground range, the slant range is the
     hypotenuse of ground range and altitude. The same triangle in ground range has the ground range of the object. If
     the range of the image is unknown, the difference of both is part of the uncertainty.
     """
     altitude_m, slant_m = contact.altitude_m, slant_range_m(contact)
     if altitude_m is None or slant_m is None or slant_m + shadow.value_m <= 0:
-        return None
+        return {}
     shadow_end_m = slant_m + shadow.value_m
     height_m = shadow.value_m * altitude_m / shadow_end_m
     sigmas = [
@@ -423,7 +374,8 @@ def height_from_shadow(contact: Contact, shadow: Length) -> Height | None:
     if shadow.metres == "unknown":
         ground_m = math.sqrt(max(0.0, slant_m**2 - altitude_m**2))
         sigmas.append(shadow.value_m * altitude_m / (ground_m + shadow.value_m) - height_m)
-    return Height(height_m, math.hypot(*sigmas), altitude_m, slant_m)
+    inputs = {"shadow_m": shadow.value_m, "altitude_m": altitude_m, "slant_range_m": slant_m}
+    return {"height_m": height_m, "height_sigma_m": math.hypot(*sigmas), "height_inputs": inputs}
 
 
 def summary(measurements: Sequence[Mapping[str, object]]) -> dict[str, dict[str, object] | None]:

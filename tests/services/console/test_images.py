@@ -133,11 +133,11 @@ def test_height_needs_altitude_and_range():
     known = {"contact_id": "c", "vehicle_id": "v", "pixel_along_m": 0.1, "pixel_across_m": 0.05}
     without = Contact(**known)
     shadow = measure_length(without, missing, (0, 0), (0, 40))
-    assert height_from_shadow(without, shadow) is None
-    assert height_from_shadow(Contact(**known, altitude_m=5.0), shadow) is None
+    assert height_from_shadow(without, shadow) == {}
+    assert height_from_shadow(Contact(**known, altitude_m=5.0), shadow) == {}
     slant = height_from_shadow(Contact(**known, altitude_m=5.0, slant_range_m=13.0), shadow)
     ground = height_from_shadow(Contact(**known, altitude_m=5.0, ground_range_m=12.0), shadow)
-    assert slant == ground
+    assert slant == ground != {}
 
 
 FAR = {"contact_id": "c", "vehicle_id": "v", "pixel_along_m": 0.1, "pixel_across_m": 0.05, "channel": "port"}
@@ -200,7 +200,7 @@ def test_range_of_square_pixels_is_unknown():
     assert length.value_m == pytest.approx(1.0)
     assert length.range_sigma_m == pytest.approx(ground.value_m - 1.0)
     height = height_from_shadow(square, measure_length(square, missing, (20, 20), (20, 40), to_ground=False))
-    assert height.sigma_m > 1.0 * 5 / (12 + 1) - 1.0 * 5 / (13 + 1)
+    assert height["height_sigma_m"] > 1.0 * 5 / (12 + 1) - 1.0 * 5 / (13 + 1)
 
 
 def test_mark_and_box_contain_the_contact_of_a_snippet():
