@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-from dataclasses import dataclass
 from typing import Final
 
 from sonarpost import wire
@@ -51,21 +50,9 @@ def request_columns(contact: sqlite3.Row, kind: str, estimate: RequestEstimate, 
     }
 
 
-@dataclass(frozen=True, slots=True)
-class _Result:
-    """What has arrived of the answer to a request.
-
-    Attributes:
-        contact_id: Contact or image that has it.
-        version: Its version.
-        bytes: Received bytes in addition to those at the time of the request.
-        is_whole: Whether the answer is complete.
-    """
-
-    contact_id: str
-    version: int
-    bytes: int
-    is_whole: bool
+_Result = tuple[str, int, int, bool]
+"""What has arrived of an answer: contact or image that has it, its version, bytes in addition to those at the time of
+the request, whether the answer is complete."""
 
 
 def update_results(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> None:
@@ -83,18 +70,12 @@ def update_results(db: sqlite3.Connection, contact_id: str, now_utc_s: float) ->
     for request in open_requests:
         result = _result_of(db, request, contact)
         known = (request["result_contact"], request["result_version"], request["result_bytes"])
-        if result is None or (not result.is_whole and (result.contact_id, result.version, result.bytes) == known):
+        if result is None or (not result[3] and result[:3] == known):
             continue
         db.execute(
             "UPDATE request SET result_contact = ?, result_version = ?, result_bytes = ?, arrived_utc_s = ?"
             " WHERE command_id = ?",
-            (
-                result.contact_id,
-                result.version,
-                result.bytes,
-                now_utc_s if result.is_whole else None,
-                request["command_id"],
-            ),
+            (*result[:3], now_utc_s if result[3] else None, request["command_id"]),
         )
 
 
@@ -112,7 +93,7 @@ def _result_of(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Ro
             " ORDER BY arrived_utc_s DESC LIMIT 1",
             (contact["id"], kind),
         ).fetchone()
-        return None if row is None else _Result(row["id"], row["version"], row["bytes_received"], bool(row["complete"]))
+        return None if row is None else tuple(row)
     if contact["version"] <= (request["base_version"] or 0):
         return None
     more_bytes = contact["bytes_received"] - base_bytes
@@ -120,7 +101,7 @@ def _result_of(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Ro
     if kind == "refine":
         # Bytes up to the length announced at the time of the request were coming without it.
         is_whole = is_whole and contact["bytes_received"] > max(base_bytes, request["base_total"] or 0)
-    return _Result(contact["id"], contact["version"], more_bytes, is_whole) if more_bytes > 0 or is_whole else None
+    return (contact["id"], contact["version"], more_bytes, is_whole) if more_bytes > 0 or is_whole else None
 
 
 def _region_result(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Row) -> _Result | None:
@@ -134,17 +115,17 @@ def _region_result(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite
         " WHERE result_contact IS NOT NULL AND command_id <> ?) ORDER BY arrived_utc_s LIMIT 1",
         (contact["id"], bottom - top, right - left, request["asked_utc_s"], request["command_id"]),
     ).fetchone()
-    return None if row is None else _Result(row["id"], row["version"], row["bytes_received"], bool(row["complete"]))
+    return None if row is None else tuple(row)
 
 
 def _revisit_result(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Row) -> _Result | None:
     """Return the first later look of the vehicle at the position of the contact."""
     row = db.execute(
-        "SELECT id, version, bytes_received FROM contact"
+        "SELECT id, version, bytes_received, 1 FROM contact"
         " WHERE group_id = ? AND vehicle_id = ? AND id <> ? AND seen_utc_s > ? ORDER BY seen_utc_s LIMIT 1",
         (contact["group_id"], contact["vehicle_id"], contact["id"], request["asked_utc_s"]),
     ).fetchone()
-    return None if row is None else _Result(row["id"], row["version"], row["bytes_received"], is_whole=True)
+    return None if row is None else tuple(row)
 
 
 def contacts_with_requests(db: sqlite3.Connection, contact_id: str) -> list[str]:

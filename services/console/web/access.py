@@ -16,6 +16,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.convertors import IntegerConvertor, register_url_convertor
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sonarpost.errors import BadInputError, DeliveryError
@@ -210,6 +211,13 @@ class AccessControl:
                 return error_response(error)
 
         return serve
+
+    def post(
+        self, path: str, handler: Handler, permission: Permission | None = None, *, needs_session: bool = True
+    ) -> Route:
+        """Return a route of POST requests; see `endpoint`."""
+        endpoint = self.endpoint(handler, permission=permission, needs_session=needs_session)
+        return Route(path, endpoint, methods=["POST"])
 
     def _check(self, request: Request, session: Session | None, permission: Permission | None) -> None:
         if session is None:

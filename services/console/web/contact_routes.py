@@ -25,7 +25,6 @@ from sonarpost.review import rendering, true_scale
 from sonarpost.review.measurement import Line, MeasurementKind
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contacts import ContactFilter
-from sonarpost.services.console.store.database import Permission
 from sonarpost.services.console.store.related_images import Relation
 from sonarpost.services.console.web.access import AccessControl, Call, RequestBody
 
@@ -37,14 +36,17 @@ ImageLayer = Literal["raw", Relation]
 _Point = tuple[Annotated[float, Field(ge=0, le=4096)], Annotated[float, Field(ge=0, le=4096)]]
 
 
-class CommentBody(RequestBody):
-    """Fields of a comment, and of a decision."""
+class VerdictBody(RequestBody):
+    """Fields of a decision, and of a comment."""
 
-    version: Version
-    verdict: Verdict | None = None
     confidence: Annotated[float, Field(ge=0, le=1)] | None = None
     mlo_class: Annotated[str, Field(min_length=1, max_length=60)] | None = None
     remark: Annotated[str, Field(max_length=2000)] = ""
+
+
+class _CommentBody(VerdictBody):
+    version: Version
+    verdict: Verdict | None = None
 
 
 class _MeasureBody(RequestBody):
@@ -73,11 +75,7 @@ class ContactRoutes:
         """Return the routes."""
         contact = "/api/contacts/{id}"
         version = contact + "/versions/{version:number}"
-        read, state = access.endpoint, self._state
-
-        def write(path: str, handler: Callable[[Call], Response], permission: Permission) -> Route:
-            return Route(path, access.endpoint(handler, permission=permission), methods=["POST"])
-
+        read, post, state = access.endpoint, access.post, self._state
         return [
             Route(
                 "/api/contacts", read(lambda call: JSONResponse(state.list_contacts(call.parse_query(ContactFilter))))
@@ -86,10 +84,10 @@ class ContactRoutes:
             Route(version + "/image.png", read(self._image)),
             Route(version + "/mask.png", read(self._mask)),
             Route(version + "/thumbnail.png", read(self._thumbnail)),
-            write(contact + "/measure", self._measure, "measure"),
-            write(contact + "/measure/{measurement:number}/withdraw", self._withdraw_measurement, "measure"),
-            write(contact + "/requests", self._add_request, "request"),
-            write(contact + "/comment", self._add_comment, "comment"),
+            post(contact + "/measure", self._measure, "measure"),
+            post(contact + "/measure/{measurement:number}/withdraw", self._withdraw_measurement, "measure"),
+            post(contact + "/requests", self._add_request, "request"),
+            post(contact + "/comment", self._add_comment, "comment"),
         ]
 
     # Images
@@ -131,7 +129,7 @@ class ContactRoutes:
         return JSONResponse(found, 201)
 
     def _add_comment(self, call: Call) -> Response:
-        body = call.parse_body(CommentBody)
+        body = call.parse_body(_CommentBody)
         image = self._state.image(contact_id(call), body.version)
         record = Comment(
             **body.model_dump(exclude={"version"}),
@@ -147,5 +145,5 @@ class ContactRoutes:
 
 
 def contact_id(call: Call) -> str:
-    """Return the contact identifier in the path of a request."""
+    """Return the identifier in the path of a request."""
     return str(call.request.path_params["id"])

@@ -170,9 +170,9 @@ class ExportRoutes:
     def routes(self, access: AccessControl) -> list[Route]:
         """Return the routes."""
         return [
-            Route("/api/export", access.endpoint(self._progress), methods=["GET"]),
-            Route("/api/export/cancel", access.endpoint(self._cancel), methods=["POST"]),
-            Route("/api/export/{name}", access.endpoint(self._export), methods=["GET"]),
+            Route("/api/export", access.endpoint(self._progress)),
+            access.post("/api/export/cancel", self._cancel),
+            Route("/api/export/{name}", access.endpoint(self._export)),
         ]
 
     def stop(self) -> None:

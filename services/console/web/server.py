@@ -46,7 +46,6 @@ from sonarpost.services.console.web.decision_routes import DecisionRoutes
 from sonarpost.services.console.web.event_stream import EventStream
 from sonarpost.services.console.web.export_routes import ExportRoutes, offered_formats
 from sonarpost.services.console.web.map_routes import MapRoutes
-from sonarpost.services.console.web.object_routes import ObjectRoutes
 from sonarpost.services.console.web.report import ReportRoutes
 from sonarpost.services.console.web.session_routes import SessionRoutes, SettingsRoutes
 
@@ -77,7 +76,6 @@ class ConsoleApp:
             *SettingsRoutes(users).routes(access),
             *ContactRoutes(state).routes(access),
             *DecisionRoutes(state).routes(access),
-            *ObjectRoutes(state).routes(access),
             *self._map.routes(access),
             Route("/api/score", access.endpoint(lambda call: JSONResponse(state.score_sheet(call.actor)))),
             *self._exports.routes(access),

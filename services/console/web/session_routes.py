@@ -62,11 +62,11 @@ class SessionRoutes:
     def routes(self, access: AccessControl) -> list[Route]:
         """Return the routes."""
         return [
-            Route(LOGIN, access.endpoint(self._login, needs_session=False), methods=["POST"]),
-            Route("/api/login-link", access.endpoint(self._login_link, needs_session=False), methods=["POST"]),
+            access.post(LOGIN, self._login, needs_session=False),
+            access.post("/api/login-link", self._login_link, needs_session=False),
             Route("/api/session", access.endpoint(self._session)),
-            Route("/api/logout", access.endpoint(self._logout), methods=["POST"]),
-            Route("/api/password", access.endpoint(self._password), methods=["POST"]),
+            access.post("/api/logout", self._logout),
+            access.post("/api/password", self._password),
         ]
 
     def _login(self, call: Call) -> Response:
@@ -170,8 +170,8 @@ class SettingsRoutes:
     def routes(self, access: AccessControl) -> list[Route]:
         """Return the routes."""
         return [
-            Route("/api/settings", access.endpoint(self._read), methods=["GET"]),
-            Route("/api/settings", access.endpoint(self._write), methods=["POST"]),
+            Route("/api/settings", access.endpoint(self._read)),
+            access.post("/api/settings", self._write),
         ]
 
     def _read(self, call: Call) -> Response:
