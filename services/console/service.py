@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 import zenoh
@@ -68,11 +68,6 @@ _CURSOR = "cursor"
 """Name of the store's state entry: position in the records of c2."""
 SHORE_DELIVERY_MARGIN_S = 2.0
 """Age that a decision must have before the relay's health proves its delivery: health is older than its arrival."""
-_ACKNOWLEDGED = "acknowledged/"
-"""Prefix of the store's state entries: {prefix}{table}/{consumer}/{record_id} -> reason of a refusal, or empty."""
-
-_Acknowledgement = tuple[Table, str, str, str | None]
-T = TypeVar("T")
 R = TypeVar("R", bound=Record)
 
 
@@ -153,24 +148,20 @@ class ConsoleService(Service[ConsoleConfig]):
     # Sending
 
     def _send_loop(self) -> None:
-        """Queue the records of operators' actions in the outbox, and apply acknowledgements."""
+        """Queue the records of operators' actions in the outbox."""
         while not self.stopping.wait(UPDATE_INTERVAL_S):
             try:
-                states = {_ACKNOWLEDGED + name: value for name, value in self.store.states(_ACKNOWLEDGED).items()}
-                known = self.store.readable(states, _acknowledgement)
-                failed = self._each(self._apply_acknowledgement, known.items())
-                failed = self._each(self._send, self.state.unsent_records()) or failed
-                self._send_error = failed
+                self._send_error = self._send_all()
             except (OSError, DeliveryError) as error:
                 self._send_error = f"{type(error).__name__}: {error}"
                 log.error("Records not queued, trying again", extra=kv(reason=str(error)))
 
-    def _each(self, apply: Callable[[T], None], items: Iterable[T]) -> str:
-        """Call `apply` with each item; return the unexpected exception of an item, which does not delay the others."""
+    def _send_all(self) -> str:
+        """Queue the records; return the unexpected exception of one of them, which does not delay the others."""
         failed = ""
-        for item in items:
+        for item in self.state.unsent_records():
             try:
-                apply(item)
+                self._send(item)
             except (OSError, DeliveryError):
                 raise
             except Exception as error:
@@ -204,15 +195,9 @@ class ConsoleService(Service[ConsoleConfig]):
 
     @override
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
-        """Store an acknowledgement. The send loop applies it to the console's database after this transaction."""
+        """Apply an acknowledgement to the console's database. After a crash it arrives again, and changes nothing."""
         table, record_id = _table_and_id(item)
-        tx.put_state(f"{_ACKNOWLEDGED}{table}/{item.queue}/{record_id}", b"" if reason is None else reason.encode())
-
-    def _apply_acknowledgement(self, item: tuple[str, _Acknowledgement]) -> None:
-        name, (table, consumer, record_id, reason) = item
-        self.state.apply_acknowledgement(table, record_id, consumer, reason)
-        with self.store.transaction() as tx:
-            tx.delete_state(name)
+        self.state.apply_acknowledgement(table, record_id, item.queue, reason)
 
     # Subscriptions
 
@@ -460,15 +445,6 @@ class ConsoleService(Service[ConsoleConfig]):
             "contacts_to_do": float(counts.to_do),
             "pages_open": float(self.state.events.subscriber_count),
         }
-
-
-def _acknowledgement(name: str, value: bytes) -> _Acknowledgement:
-    """Return table, consumer and identifier of an acknowledged record, and the reason of a refusal."""
-    table, consumer, record_id = name.removeprefix(_ACKNOWLEDGED).split("/", 2)
-    if table not in RECORD_TYPES:
-        raise ValueError(f"table {table}")
-    # A refusal always has a reason.
-    return table, consumer, record_id, value.decode() or None
 
 
 def _check_key(key: str, record: Record) -> None:

@@ -40,7 +40,7 @@ from sonarpost.services.console.store.contact_detail import (
     contact_detail_json,
     withdraw_measurement,
 )
-from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter, NotFoundError
+from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter, NotFoundError, remove_images
 from sonarpost.services.console.store.database import (
     Actor,
     Database,
@@ -53,7 +53,6 @@ from sonarpost.services.console.store.database import (
 )
 from sonarpost.services.console.store.decisions import DecisionInput, DeliveryStates
 from sonarpost.services.console.store.requests import VehicleLink, costs_json, estimate_request
-from sonarpost.services.console.store.retention import remove_images
 from sonarpost.services.console.store.serialisers import RECORD_JSON, Json, contact_json, decode_image
 from sonarpost.services.console.store.truth import Truth
 

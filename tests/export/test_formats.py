@@ -33,7 +33,7 @@ from sonarpost.export.source import ExportSource, StoredImages
 from sonarpost.export.tables import COLUMNS
 from sonarpost.export.text import csv_text, html_text, probabilities_text, xml_text
 from sonarpost.messages import Pixels
-from sonarpost.review.measured_size import MeasuredSize
+from sonarpost.review.measurement import MeasuredSize
 
 GOLDEN = GOLDEN_FOLDER / "export"
 KML = "{http://www.opengis.net/kml/2.2}"

@@ -1,6 +1,6 @@
 """Size of an object from the measurements of operators."""
 
-from sonarpost.review.measured_size import MeasuredSize, measured_size
+from sonarpost.review.measurement import MeasuredSize, measured_size
 
 
 def body(kind, value_m, **fields):

@@ -36,7 +36,7 @@ from sonarpost.messages import (
     Time,
 )
 from sonarpost.review.decisions import ReviewResult, ReviewState, review_result
-from sonarpost.review.measured_size import MeasuredSize
+from sonarpost.review.measurement import MeasuredSize
 from sonarpost.wire import first_error
 
 MAX_FILE_BYTES: Final = 1 << 22

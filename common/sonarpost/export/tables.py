@@ -13,7 +13,7 @@ from sonarpost.export.contacts import ExportContact
 from sonarpost.export.source import ExportSource
 from sonarpost.export.text import csv_text, utc_text, xml_text
 from sonarpost.messages import Contact
-from sonarpost.review.measured_size import SIZE_FIELDS
+from sonarpost.review.measurement import SIZE_FIELDS
 
 Value = str | int | float | bool | None
 

@@ -16,8 +16,7 @@ from sonarpost.export.contacts import ExportContact, ImageSideCar, side_car
 from sonarpost.export.tables import further_values
 from sonarpost.messages import Decision, ReconstructedImage
 from sonarpost.modem.interface import RateInfo
-from sonarpost.review.measured_size import measured_size
-from sonarpost.review.measurement import summary
+from sonarpost.review.measurement import measured_size, summary
 from sonarpost.review.objects import AssociationRule
 from sonarpost.review.true_scale import ImageLine
 from sonarpost.services.console.store.association import earlier_contacts

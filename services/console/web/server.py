@@ -1,4 +1,4 @@
-"""The console's web application with the files that a browser installs, and the server that runs it in a thread."""
+"""The console's web application, the files that a browser installs, and its server: a thread, with deadlines."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import functools
 import hashlib
 import json
 import logging
+import math
 import os
 import re
 import socket
 import ssl
 import threading
+from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Final
@@ -20,10 +22,10 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import FileResponse, HTMLResponse, JSONResponse, RedirectResponse, Response
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import PathLike, StaticFiles
-from starlette.types import ASGIApp, Scope
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from typing_extensions import override
 
 from sonarpost.config import TlsConfig
@@ -40,7 +42,6 @@ from sonarpost.services.console.web.access import (
     SecurityMiddleware,
     error_response,
 )
-from sonarpost.services.console.web.connections import ConnectionDeadlines
 from sonarpost.services.console.web.contact_routes import ContactRoutes
 from sonarpost.services.console.web.decision_routes import DecisionRoutes
 from sonarpost.services.console.web.event_stream import EventStream
@@ -315,3 +316,65 @@ def installation_routes(static: Path) -> list[Route]:
         return Response(service_worker(static), media_type="text/javascript", headers=_NO_CACHE)
 
     return [Route(f"/{MANIFEST}", manifest), Route(f"/{WORKER}", worker)]
+
+
+CHUNK_BYTES: Final = 65536
+"""Size of the parts of a response; a client has a limited time to read each."""
+
+
+class ConnectionDeadlines:
+    """ASGI middleware that sets the deadlines of connections.
+
+    A client has `request_s` to send a request, and `read_s` to read each chunk of the response. While the server
+    prepares a response, and between the events of a stream, there is no deadline.
+
+    Args:
+        app: The application.
+        limits: The open connections.
+    """
+
+    def __init__(self, app: ASGIApp, limits: ConnectionLimits) -> None:
+        self._app = app
+        self._limits = limits
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        limits, peer = self._limits, scope["client"]
+        if peer not in limits:
+            # The connection was closed for another one, and its address is unknown.
+            response = PlainTextResponse("too many connections", 503, {"Connection": "close"})
+            await response(scope, receive, send)
+            return
+
+        async def receive_in_time() -> Message:
+            message = await receive()
+            if not message.get("more_body", False):
+                limits.set_deadline(peer, math.inf)
+            return message
+
+        async def send_in_time(message: Message) -> None:
+            for part in _parts(message):
+                limits.set_deadline(peer, limits.read_s)
+                await send(part)
+            limits.set_deadline(peer, math.inf)
+
+        if scope["method"] in ("GET", "HEAD"):
+            limits.set_deadline(peer, math.inf)
+        try:
+            await self._app(scope, receive_in_time, send_in_time)
+        finally:
+            limits.set_deadline(peer, limits.request_s)
+
+
+def _parts(message: Message) -> Iterable[Message]:
+    """Split the body of a response: the server waits for the client only between messages."""
+    body = message.get("body", b"")
+    if message["type"] != "http.response.body" or len(body) <= CHUNK_BYTES:
+        yield message
+        return
+    for start in range(0, len(body), CHUNK_BYTES):
+        yield {**message, "body": bytes(body[start : start + CHUNK_BYTES]), "more_body": True}
+    yield {**message, "body": b""}

@@ -14,7 +14,7 @@ from hypothesis import given
 from sonarpost.export.contacts import load_contacts
 from sonarpost.export.text import xml_text
 from sonarpost.extensions.tak.cot import cot_event, cot_events, cot_type
-from sonarpost.review.measured_size import MeasuredSize
+from sonarpost.review.measurement import MeasuredSize
 
 NOW_UTC_S = FIRST_UTC_S + 3600
 

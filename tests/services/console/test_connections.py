@@ -15,8 +15,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.testclient import TestClient
 
 from sonarpost.network.connections import ConnectionLimits, TrustedProxies, address_group
-from sonarpost.services.console.web.connections import CHUNK_BYTES, ConnectionDeadlines
-from sonarpost.services.console.web.server import WebServer
+from sonarpost.services.console.web.server import CHUNK_BYTES, ConnectionDeadlines, WebServer
 
 HALF_A_REQUEST = b"GET /login HTTP/1.1\r\nHost: 127.0.0.1\r\n"
 HALF_A_BODY = b"POST /api/login HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 99999\r\n\r\n"

@@ -20,8 +20,13 @@ from sonarpost.services.console.store.users import (
     Users,
 )
 from sonarpost.services.console.web.access import ApiError
-from sonarpost.services.console.web.login_limiter import MAX_CHECKS, RATE_OF_ADDRESS, RATE_OF_SOURCE, LoginLimiter
-from sonarpost.services.console.web.session_routes import DEVICE_COOKIE
+from sonarpost.services.console.web.session_routes import (
+    DEVICE_COOKIE,
+    MAX_CHECKS,
+    RATE_OF_ADDRESS,
+    RATE_OF_SOURCE,
+    LoginLimiter,
+)
 
 NO_TLS = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 """Saves the time for loading certificates in each client."""

@@ -9,7 +9,7 @@ from builders.console import PASSWORD
 from sonarpost.cli.main import main
 from sonarpost.errors import BadInputError
 from sonarpost.services.console.store.users import FILE_NAME, LINK_S, MAX_LINKS_OF_USER, Users
-from sonarpost.services.console.web.login_limiter import RATE_OF_ADDRESS
+from sonarpost.services.console.web.session_routes import RATE_OF_ADDRESS
 
 
 def use(browser, token):

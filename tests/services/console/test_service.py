@@ -147,9 +147,6 @@ def test_invalid_subscribed_and_stored_records_affect_no_other(start, client, mo
 
     monkeypatch.setattr(console.state, "apply_tasking_state", fail)
     monkeypatch.setattr(console.state, "fleet_state", dict)
-    with console.store.transaction() as tx:
-        tx.put_state("acknowledged/invalid", b"")
-        tx.put_state("acknowledged/decision/relay/d-1", b"\xff")
     console._subscribe(keys.tasking_state(VESSEL), TaskingState, fail)
     state = TaskingState(vessel_id=VESSEL, kind="command", record_id="c-1", state="delivered", changed_utc_s=1.0)
     put(client, keys.tasking_state(VESSEL), state)
@@ -157,8 +154,6 @@ def test_invalid_subscribed_and_stored_records_affect_no_other(start, client, mo
     put(client, keys.acoustic_queue("uuv-1"), queue_state([], 1.0))
     eventually(lambda: "uuv-1" in console.state.fleet.vehicles(), what="queue")
     eventually(lambda: console.health().counters["records_ignored"] == 2, what="ignored records")
-    eventually(lambda: console.store.states("acknowledged/") == {}, what="quarantine")
-    assert console.health().state == "degraded"
 
 
 @pytest.mark.parametrize("error", [OverflowError("too large"), sqlite3.IntegrityError("NOT NULL constraint failed")])

@@ -8,9 +8,9 @@ from builders.record_samples import SAMPLES
 
 from sonarpost.messages import ReceivedStatus, VehicleStatus
 from sonarpost.review.positions import destination
-from sonarpost.services.console.coverage import covered_area_m2
 from sonarpost.services.console.store import tracks
 from sonarpost.services.console.store.database import DATABASE_NAME, Database
+from sonarpost.services.console.store.tracks import covered_area_m2
 
 START_S = 1_700_000_000.0
 CORNER = (56.0, -5.0)

@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.signal import fftconvolve
 
-from sonarpost.review.image_matching import _convolve_valid, place_in_expanded
+from sonarpost.services.console.store.related_images import _convolve_valid, place_in_expanded
 
 
 def seabed(seed=0):
