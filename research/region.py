@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from research.common.command import command_parser, run_command
+from research.common.emb_estimate import encode_with_estimate
 from research.common.images import sdvd_crops
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.side_info import SIXTEENTHS, RegionOfInterest
@@ -39,7 +40,7 @@ def measure(
     continued = codec.extend(codec.encode(image, base_bytes), image, base_bytes + more_bytes)
     step = BOX_STEPS // SIXTEENTHS
     region = RegionOfInterest(box.top // step, box.left // step, (box.bottom - 1) // step, (box.right - 1) // step)
-    weighted = codec.encode_with_estimate(image, more_bytes, region=region).stream
+    weighted = encode_with_estimate(codec, image, more_bytes, region=region).stream
     alone = codec.encode(inside, more_bytes)
     whole = [codec.decode(stream).image[top:bottom, left:right] for stream in (continued, weighted)]
     return psnr_db(inside, whole[0]), psnr_db(inside, whole[1]), psnr_db(inside, codec.decode(alone).image)

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from research.common.emb_estimate import encode_with_estimate
 from research.common.quality import psnr_db, ssim
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import Image, Mask
@@ -100,7 +101,7 @@ class Codecs:
 
     def code(self, pixels: Image, number: int, stream_bytes: int) -> LinkImage:
         """Encode an image with both codecs."""
-        encoded = self.emb.encode_with_estimate(pixels, stream_bytes)
+        encoded = encode_with_estimate(self.emb, pixels, stream_bytes)
         height_px, width_px = pixels.shape
         contact = ContactSummary(
             height_px=int(height_px),

@@ -10,8 +10,8 @@ strength to the image; the pixelser chooses its share.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -177,18 +177,6 @@ def _assign_folds(groups: Sequence[str], training: Sequence[SampleImage]) -> dic
     return folds
 
 
-@runtime_checkable
-class GrainCodec(Protocol):
-    """A codec whose streams may describe the texture of the bottom."""
-
-    def speckle_layer(self, stream: bytes) -> npt.NDArray[np.int16]:
-        """Return the synthetic texture to be added to the decoded image, shape (height, width), int16.
-
-        Raises:
-            StreamError: The stream is not of this codec, or has no description of the texture.
-        """
-
-
 def with_grain(codec: Codec, stream: bytes, image: Image, strength: float = DEFAULT_GRAIN_STRENGTH) -> Image | None:
     """Return a decoded image with synthetic texture; None if codec or stream do not support it.
 
@@ -198,6 +186,9 @@ def with_grain(codec: Codec, stream: bytes, image: Image, strength: float = DEFA
         image: The decoded image, shape (height, width), uint8.
         strength: Share of the texture that is added, 0..2.
     """
+    # Imported lazily: it loads numba.
+    from research.recognition.grain import GrainCodec  # noqa: PLC0415
+
     if not isinstance(codec, GrainCodec):
         return None
     try:
@@ -212,6 +203,7 @@ def codec_with_grain(codec: Codec) -> Codec | None:
     """Return the codec with a description of the texture in its streams, within the same budget; None if not emb."""
     if codec.name != emb.NAME:
         return None
-    from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415  imported lazily: it loads numba
+    from research.recognition.grain import GrainCodec  # noqa: PLC0415  imported lazily: it loads numba
+    from sonarpost.codec.emb.codec import EmbCodec  # noqa: PLC0415
 
-    return replace(codec, send_texture=True) if isinstance(codec, EmbCodec) else None
+    return GrainCodec(codec.model, codec.strength) if isinstance(codec, EmbCodec) else None

@@ -23,10 +23,10 @@ from sonarpost.codec.emb.side_info import RegionOfInterest
 from sonarpost.codec.jit import compilation_log
 image = np.random.default_rng(0).integers(0, 256, (75, 48), dtype=np.uint8)
 for model in ("standard", "structure"):
-    codec = EmbCodec(model, send_texture=True)
-    stream = codec.encode_with_estimate(image, 90, region=RegionOfInterest(2, 2, 7, 7)).stream
+    codec = EmbCodec(model)
+    header, best = codec.best_trial(image, 90, region=RegionOfInterest(2, 2, 7, 7), texture=(1,) * 8)
+    stream = header.pack() + best.body
     codec.extend(stream, image, 150)
-    codec.speckle_layer(stream)
     codec.decode(stream[:20])
     c.decode(c.encode(image.astype(np.uint16) * 257, model=model))
 c.decode(c.encode(image, "vq"))

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from research.common.emb_estimate import decode_before_enhancer
 from research.training.emb.train import write_model
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.model import CHANNELS, DILATIONS, IMAGE_FEATURES, Model, parse, read_arrays
@@ -38,7 +39,7 @@ def coded(codec: EmbCodec, images: np.ndarray, rng: np.random.Generator, streams
             length = int(size * image.size / 6400)
             full_length = length if i % 2 == 0 else int(length * rng.uniform(1, 4))
             stream = EmbCodec(codec.network, start_steps=(int(rng.integers(8)),)).encode(image, full_length)
-            plain = codec.decode_before_enhancer(stream[:length])
+            plain = decode_before_enhancer(codec, stream[:length])
             low, high = -64 * plain.mean, 64 * (255 - plain.mean)
             planes.append(np.clip(plain.plane, low, high).astype(np.int16))
             means.append(plain.mean)

@@ -9,6 +9,7 @@ from builders.images import contact
 from hypothesis import given
 from hypothesis import strategies as st
 
+from research.common.emb_estimate import decode_before_enhancer, encode_with_estimate
 from research.common.quality import psnr_db
 from sonarpost.codec.emb import MODEL_FILES, transform
 from sonarpost.codec.emb.codec import EmbCodec
@@ -101,11 +102,11 @@ def test_error_of_any_image_is_bounded(height_px: int, width_px: int, seed: int,
 
 def test_error_estimate_of_each_prefix_is_accurate() -> None:
     image = contact()
-    result = CODEC.encode_with_estimate(image, 200)
+    result = encode_with_estimate(CODEC, image, 200)
     assert result.mean_square_error.shape == (201,)
     assert np.isinf(result.mean_square_error[:4]).all()
     for length in (12, 30, 64, 120, 200):
-        decoded = CODEC.decode_before_enhancer(result.stream[:length])
+        decoded = decode_before_enhancer(CODEC, result.stream[:length])
         error = decoded.plane / 64 + decoded.mean - image
         assert (error**2).mean() == pytest.approx(result.mean_square_error[length], rel=0.1)
     known = result.mean_square_error[6:]

@@ -1,13 +1,11 @@
 """Despeckling: the estimate, its strength in the stream, and the same result on all machines."""
 
 import hashlib
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from research.common.quality import psnr_db
-from sonarpost.codec.emb import codec as emb_codec
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.despeckle import ACTIVATION_LIMIT, INPUT_LIMIT, check_strength, despeckled, network
 from sonarpost.errors import ConfigError
@@ -97,11 +95,3 @@ def test_a_longer_stream_continues_with_the_strength_of_the_stream() -> None:
     decoded = EmbCodec().decode(longer)
     assert decoded.despeckle_strength == 1.0
     assert psnr_db(despeckled(noisy), decoded.image) > psnr_db(noisy, decoded.image) + 3
-
-
-def test_texture_is_measured_on_the_image_before_despeckling(monkeypatch: pytest.MonkeyPatch) -> None:
-    noisy, measured = speckled(scene(48, 64)), []
-    inner = emb_codec.measure_speckle
-    monkeypatch.setattr(emb_codec, "measure_speckle", lambda grey, layout: measured.append(grey) or inner(grey, layout))
-    replace(EmbCodec(strength=1.0), send_texture=True).encode(noisy, 100)
-    assert np.array_equal(measured[0], noisy)

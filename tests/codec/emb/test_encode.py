@@ -6,6 +6,7 @@ from builders.images import contact
 from hypothesis import given
 from hypothesis import strategies as st
 
+from research.common.emb_estimate import encode_with_estimate
 from research.common.quality import psnr_db
 from sonarpost.codec.emb import rate_distortion_opt, transform
 from sonarpost.codec.emb.codec import EmbCodec, EncodedTrial, TrialEncoder, next_step
@@ -122,7 +123,7 @@ def test_smallest_budgets_with_a_region_are_met() -> None:
     """The budget may end in the side information."""
     image = contact(33, 48)
     for budget in range(9, 16):
-        stream = CODEC.encode_with_estimate(image, budget, region=RegionOfInterest(3, 3, 8, 9)).stream
+        stream = encode_with_estimate(CODEC, image, budget, region=RegionOfInterest(3, 3, 8, 9)).stream
         assert len(stream) <= budget
         assert CODEC.decode(stream).image.shape == image.shape
 
@@ -130,7 +131,7 @@ def test_smallest_budgets_with_a_region_are_met() -> None:
 @given(seed=st.integers(0, 1000), short=st.integers(9, 60), more=st.integers(0, 60), with_region=st.booleans())
 def test_extension_keeps_the_prefix_within_the_budget(seed: int, short: int, more: int, with_region: bool) -> None:
     image, region = contact(33, 48, seed), RegionOfInterest(3, 3, 8, 9) if with_region else None
-    stream = CODEC.encode_with_estimate(image, short, region=region).stream
+    stream = encode_with_estimate(CODEC, image, short, region=region).stream
     longer = CODEC.extend(stream, image, len(stream) + more)
     assert longer.startswith(stream[:-1])
     assert len(stream) <= len(longer) <= len(stream) + more

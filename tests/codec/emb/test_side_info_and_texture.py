@@ -1,4 +1,4 @@
-"""Side information, region of interest, speckle, and the golden streams of emb."""
+"""Side information, region of interest, and the golden streams of emb."""
 
 import hashlib
 import json
@@ -10,9 +10,10 @@ from builders.common import GOLDEN_FOLDER
 from hypothesis import given
 from hypothesis import strategies as st
 
+from research.common.emb_estimate import encode_with_estimate
+from research.recognition.grain import GrainCodec
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.coder import Coder
-from sonarpost.codec.emb.decode import measure_speckle, synthesise_speckle
 from sonarpost.codec.emb.model import shipped_model
 from sonarpost.codec.emb.side_info import (
     INSIDE_WEIGHT,
@@ -79,7 +80,7 @@ def test_region_of_interest_gets_more_bits() -> None:
     rows, columns = pixels_of(region)
     errors = []
     for chosen in (None, region):
-        decoded = CODEC.decode(CODEC.encode_with_estimate(image, 128, region=chosen).stream).image.astype(float)
+        decoded = CODEC.decode(encode_with_estimate(CODEC, image, 128, region=chosen).stream).image.astype(float)
         square = (decoded - image) ** 2
         errors.append((square[rows, columns].mean(), square.mean()))
     assert errors[1][0] < 0.97 * errors[0][0]
@@ -99,43 +100,6 @@ def test_region_weights_cover_the_region_and_others_are_rejected() -> None:
             RegionOfInterest(*corners)
 
 
-def test_speckle_is_a_separate_layer() -> None:
-    image = speckled()
-    with_texture = EmbCodec(send_texture=True)
-    stream = with_texture.encode(image, 68)
-    decoded = with_texture.decode(stream).image
-    layer = CODEC.speckle_layer(stream)
-    assert layer.shape == image.shape
-    assert layer.dtype == np.int16
-    assert np.array_equal(layer, with_texture.speckle_layer(stream))
-    assert np.array_equal(with_texture.decode(stream).image, decoded)
-    assert abs(float(layer.mean())) < 6
-    with pytest.raises(StreamError, match="texture"):
-        CODEC.speckle_layer(CODEC.encode(image, 68))
-
-
-def test_speckle_restores_the_strength_of_the_texture() -> None:
-    image = speckled()
-    layout = layout_of(80, 80)
-    levels = measure_speckle(image, layout)
-    assert len(levels) == 8
-    decoded = CODEC.decode(CODEC.encode(image, 64)).image
-    textured = np.clip(decoded + synthesise_speckle(decoded, layout, levels), 0, 255).astype(np.uint8)
-    assert abs(textured[60:].std() / image[60:].std() - 1) < 0.3
-    assert decoded[60:].std() < 0.6 * image[60:].std()
-    # Two levels are a factor of 2 in strength.
-    softer = (image.astype(int) // 2 + int(image.mean()) // 2).astype(np.uint8)
-    difference = np.array(levels[:4]) - measure_speckle(softer, layout)[:4]
-    assert np.all((difference >= 1) & (difference <= 3))
-
-
-def test_flat_image_has_no_speckle() -> None:
-    layout = layout_of(64, 64)
-    flat = np.full((64, 64), 90, np.uint8)
-    assert measure_speckle(flat, layout) == (0,) * 8
-    assert not synthesise_speckle(flat, layout, (0,) * 8).any()
-
-
 def test_extreme_bodies_decode() -> None:
     """No body is rejected; others are in the contract of the codecs."""
     header = CODEC.encode(speckled(32, 48), 40)[:4]
@@ -147,7 +111,7 @@ def test_extreme_bodies_decode() -> None:
 
 
 def golden_cases(model: str = "standard", strength: float = 0.0) -> dict[str, tuple[np.ndarray, int, EmbCodec]]:
-    plain, with_texture = (EmbCodec(model, strength, send_texture=texture) for texture in (False, True))
+    plain, with_texture = EmbCodec(model, strength), GrainCodec(model, strength)
     return {
         "80x80 at 64 B": (speckled(), 64, plain),
         "140x80 at 256 B": (speckled(140, 80), 256, plain),
@@ -161,7 +125,7 @@ def hashes(stream: bytes, codec: EmbCodec) -> dict[str, str]:
     """Return hashes of the images of the stream and of its first half."""
     parts = {"half": stream[: len(stream) // 2], "whole": stream}
     out = {name: hashlib.sha256(codec.decode(part).image.tobytes()).hexdigest() for name, part in parts.items()}
-    if codec.send_texture:
+    if isinstance(codec, GrainCodec):
         out["grain"] = hashlib.sha256(codec.speckle_layer(stream).astype("<i2").tobytes()).hexdigest()
     return out
 

@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import ClassVar, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from sonarpost.codec.emb import CODEC_IDS, DEFAULT_MODEL, DESPECKLED_CODEC_IDS, NAME, transform
 from sonarpost.codec.emb.bitplanes import (
@@ -28,15 +27,7 @@ from sonarpost.codec.emb.bitplanes import (
     reconstructed_coefficients,
 )
 from sonarpost.codec.emb.coder import Coder, CoefficientState
-from sonarpost.codec.emb.decode import (
-    DecodedCoefficients,
-    decoded_image,
-    grey_of,
-    image_before_enhancer,
-    measure_speckle,
-    read_body,
-    synthesise_speckle,
-)
+from sonarpost.codec.emb.decode import decoded_image, grey_of, read_body
 from sonarpost.codec.emb.despeckle import STRENGTH_STEPS, check_strength, despeckled
 from sonarpost.codec.emb.kernel import I64
 from sonarpost.codec.emb.model import Model, shipped_model
@@ -181,24 +172,6 @@ def _mean_of_neighbours(errors: dict[int, int], step: int, count: int) -> int:
     return sum(values) // len(values)
 
 
-def error_by_length(curve: I64, body_bytes: int, header_bytes: int, pixels: int) -> npt.NDArray[np.float64]:
-    """Return the mean squared error by stream length, from the squared error by number of bytes.
-
-    The squared error is `Coder.curve`.
-
-    Returns:
-        Shape (header_bytes + body_bytes + 1,), grey squared; infinite for lengths without an image.
-    """
-    out = np.full(header_bytes + body_bytes + 1, np.inf)
-    error = np.inf
-    for length in range(body_bytes + 1):
-        # Record n + 1 of the curve is for the byte started after the first n.
-        if 0 < length < len(curve) - 1 and curve[length] >= 0:
-            error = float(curve[length]) / transform.UNIT**2 / pixels
-        out[header_bytes + length] = error
-    return out
-
-
 def structural_similarity(original: I64, decoded: I64) -> int:
     """Return the structural similarity at a half and a quarter of the size, weighted about as by MS-SSIM.
 
@@ -243,22 +216,6 @@ _PRICE: Final = 20
 """Least squared error, in 1/256 of the squared threshold, that a bit must remove; see `kernel.code_band`."""
 
 
-@dataclass(frozen=True, eq=False)
-class Encoded:
-    """A stream with an estimate of the error of each of its prefixes.
-
-    Attributes:
-        stream: Header and body.
-        mean_square_error: Shape (len(stream) + 1,), float64: estimated mean squared error, in grey levels squared, of
-            the image that the first n bytes decode to; infinite for prefixes without an image. It is computed from the
-            coefficients: clipping and the enhancer reduce the true error by some per cent. The reference is the
-            despeckled image if the codec despeckles. With a region of interest, the error in it weighs 9/4.
-    """
-
-    stream: bytes
-    mean_square_error: npt.NDArray[np.float64]
-
-
 @dataclass(frozen=True)
 class EmbCodec:
     """The embedded codec. Implements `sonarpost.codec.Codec`. Decodes the streams of all shipped models.
@@ -267,7 +224,6 @@ class EmbCodec:
         model: Model that encodes: "standard" (least squared error), "structure" (structural similarity), or a trained
             model.
         strength: Strength of despeckling, 0..1, rounded to 1/16; 0 codes the image as it is (see `despeckle`).
-        send_texture: Whether streams carry the strength of the image's texture (4 bytes); see `speckle_layer`.
         start_steps: Start steps to try; empty: see `SEARCHES`.
 
     Raises:
@@ -276,7 +232,6 @@ class EmbCodec:
 
     model: str | Model = DEFAULT_MODEL
     strength: float = 0.0
-    send_texture: bool = False
     start_steps: tuple[int, ...] = ()
     name: ClassVar[str] = NAME
 
@@ -303,17 +258,24 @@ class EmbCodec:
 
     def encode(self, image: SnippetPixels, budget_bytes: int | None = None) -> bytes:
         """Return the stream (see `Codec.encode`); without a budget, 1/25 byte a pixel and at least 64 bytes."""
-        return self.encode_with_estimate(image, budget_bytes).stream
+        header, best = self.best_trial(image, budget_bytes)
+        return header.pack() + best.body
 
-    def encode_with_estimate(
-        self, image: SnippetPixels, budget_bytes: int | None = None, *, region: RegionOfInterest | None = None
-    ) -> Encoded:
-        """Encode and estimate the error of each prefix, from which the link computes its redundancy.
+    def best_trial(
+        self,
+        image: SnippetPixels,
+        budget_bytes: int | None = None,
+        *,
+        region: RegionOfInterest | None = None,
+        texture: tuple[int, ...] | None = None,
+    ) -> tuple[StreamHeader, EncodedTrial]:
+        """Return header and body of the stream of a snippet.
 
         Args:
             image: As for `encode`.
             budget_bytes: As for `encode`.
             region: Region of interest, which gets more of the bits. Costs 2 bytes.
+            texture: Strength of the image's texture in each band, 0..15. Costs 4 bytes.
 
         Raises:
             StreamError: As for `encode`.
@@ -326,17 +288,14 @@ class EmbCodec:
             raise StreamError("codec emb", "budget_bytes", budget, f"at least {header.size + MIN_BODY_BYTES} B")
         mean_index = min((int(grey.astype(np.int64).sum()) // grey.size + MEAN_STEP // 2) // MEAN_STEP, 63)
         targets = _targets(grey, mean_index * MEAN_STEP, region, limit, self.network)
-        texture = measure_speckle(original, targets.layout) if self.send_texture else None
         encoder = TrialEncoder(self.network, limit, _PRICE)
         sent = SideInfo(mean_index, 0, region, texture, strength=round(self.strength * STRENGTH_STEPS))
-        best = encoder.best(targets, sent, self.start_steps)
-        estimate = error_by_length(best.curve, len(best.body), header.size, grey.size)
-        return Encoded(header.pack() + best.body, estimate)
+        return header, encoder.best(targets, sent, self.start_steps)
 
     def extend(self, stream: bytes, image: SnippetPixels, budget_bytes: int) -> bytes:
         """Return a longer stream of the same snippet (see `ExtensibleCodec.extend`)."""
         grey, _ = encoder_input(self, image)
-        model, header = _model_of(stream, self.network)
+        model, header = model_of_stream(stream, self.network)
         if grey.shape != (header.height_px, header.width_px):
             raise StreamError("image", "shape", grey.shape, f"the stream's {(header.height_px, header.width_px)}")
         state, side = read_body(stream[header.size :], layout_of(header.height_px, header.width_px), model)
@@ -355,7 +314,7 @@ class EmbCodec:
 
         A truncated body gives a coarser image without missing pixels.
         """
-        model, header = _model_of(stream, self.network)
+        model, header = model_of_stream(stream, self.network)
         body, notes = before_gap(stream[header.size :], received)
         state, side = read_body(body, layout_of(header.height_px, header.width_px), model)
         if side.mean_index < 0:
@@ -363,34 +322,6 @@ class EmbCodec:
         known = side.start_step >= 0 or not model.sends_strength
         strength = side.strength / STRENGTH_STEPS if known else None
         return DecodedImage.without_gaps(decoded_image(state, side, model), notes, strength)
-
-    def speckle_layer(self, stream: bytes) -> npt.NDArray[np.int16]:
-        """Return the synthetic speckle that the decoded image lacks, as grey levels to add, shape of the image, int16.
-
-        For viewing, add half of it and clip. Do not measure on the result.
-
-        Raises:
-            StreamError: As for `decode`, or the stream carries no texture levels.
-        """
-        model, state, side = self._read(stream)
-        if side.texture is None:
-            raise StreamError("stream", "texture", None, "a stream encoded with send_texture")
-        return synthesise_speckle(decoded_image(state, side, model), state.layout, side.texture)
-
-    def decode_before_enhancer(self, stream: bytes) -> DecodedCoefficients:
-        """Return the image before the enhancer, the input for its training.
-
-        Raises:
-            StreamError: As for `decode`, or the stream is too short for an image.
-        """
-        model, state, side = self._read(stream)
-        if side.mean_index < 0:
-            raise StreamError("stream", "length", len(stream), "enough bytes for a mean level")
-        return image_before_enhancer(state, side, model)
-
-    def _read(self, stream: bytes) -> tuple[Model, CoefficientState, SideInfo]:
-        model, header = _model_of(stream, self.network)
-        return model, *read_body(stream[header.size :], layout_of(header.height_px, header.width_px), model)
 
 
 def _codec_id_of(model: Model) -> int:
@@ -404,7 +335,7 @@ def _targets(grey: Image, mean: int, region: RegionOfInterest | None, limit: int
     return target_coefficients(plane, layout, region_weights(layout, region), limit, model.perceptual)
 
 
-def _model_of(stream: bytes, own: Model) -> tuple[Model, StreamHeader]:
+def model_of_stream(stream: bytes, own: Model) -> tuple[Model, StreamHeader]:
     """Return the model of a stream and the stream's header.
 
     Raises:
