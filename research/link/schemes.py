@@ -37,6 +37,8 @@ _FRAME_S: Final = 1.0
 _MAX_STEPS: Final = 1_000_000
 PSNR_LIMIT_DB: Final = 60.0
 GREY: Final = 128
+_MIN_ERROR: Final = 0.065  # 60 dB
+_NO_IMAGE: Final = 3.0 * 55.0**2  # mean square error, against mid-grey, of an image that cannot be decoded at all
 """Grey level of an image of which nothing arrived."""
 
 
@@ -56,6 +58,12 @@ class Quality:
 def image_quality(original: Image, decoded: Image) -> Quality:
     """Compare a decoded image with the original."""
     return Quality(min(psnr_db(original, decoded), PSNR_LIMIT_DB), ssim(original, decoded))
+
+
+def psnr_by_length(mean_square_error: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the PSNR in dB by the number of bytes from the mean square error, infinite where there is no image."""
+    error = np.minimum.accumulate(np.clip(mean_square_error, _MIN_ERROR, _NO_IMAGE))
+    return np.asarray(10.0 * np.log10(255.0**2 / error), np.float64)
 
 
 @dataclass(eq=False)
@@ -278,7 +286,7 @@ def run_v1(images: Sequence[LinkImage], codecs: Codecs, setting: Setting, *, fee
     )
     sender, receiver = V1Sender(config), V1Receiver(ReceiverConfig(max_contacts=65535))
     for number, image in enumerate(images, start=1):
-        sender.add_image(number, image.contact, image.stream, 0.0, image.mean_square_error)
+        sender.add_image(number, image.contact, image.stream, 0.0, curve=psnr_by_length(image.mean_square_error))
     latest: dict[int, ImageUpdate] = {}
     frames, reports = 0, 0
     for now, frame, is_report in _exchange(

@@ -31,14 +31,12 @@ class ImageToSend:
         contact_id: Identifier of its contact on the vehicle.
         contact: The contact record.
         stream: The codec's stream, header first.
-        mean_square_error: Error of the image that the first n bytes give, for n = 0..len(stream); see `quality_curve`.
     """
 
     image_id: str
     contact_id: str
     contact: ContactSummary
     stream: bytes
-    mean_square_error: Sequence[float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,13 +13,13 @@ from sonarpost.link.coding.redundancy_plan import (
     copies,
     plan_layers,
     plan_unlayered,
-    quality_curve,
     symbols_to_send,
+    usual_curve,
 )
 
 
 def curve(scale: float, length: int = 400) -> np.ndarray:
-    return quality_curve(length, 60.0**2 / (1 + np.arange(length + 1) * scale))
+    return 10 * np.log10(255.0**2 / 60.0**2 * (1 + np.arange(length + 1) * scale))
 
 
 def test_bytes_go_to_the_steepest_slope() -> None:
@@ -43,19 +43,16 @@ def test_bytes_go_to_the_steepest_slope() -> None:
 
 
 def test_curve_with_steps_is_replaced_by_its_hull() -> None:
-    steps = quality_curve(100, np.repeat([4000.0, 3000.0, 1000.0, 900.0], [20, 30, 30, 21]))
+    steps = 10 * np.log10(255.0**2 / np.repeat([4000.0, 3000.0, 1000.0, 900.0], [20, 30, 30, 21]))
     gain = GroupDistortion.of([steps], [0])
     slopes = np.diff(gain.gain_by_step) / np.diff(gain.bytes_by_step)
     assert (np.diff(slopes) <= 1e-12).all()
     assert gain.total_bytes == 80
 
 
-@pytest.mark.parametrize("error", [[1.0], [-1.0] * 11, [float("nan")] * 11])
-def test_invalid_estimates_are_rejected(error: list[float]) -> None:
+def test_streams_that_are_too_long_are_rejected() -> None:
     with pytest.raises(StreamError, match="image"):
-        quality_curve(10, error)
-    with pytest.raises(StreamError):
-        quality_curve(70000)
+        usual_curve(70000)
 
 
 def test_uncertain_loss_leads_to_layers() -> None:

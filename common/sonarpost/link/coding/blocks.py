@@ -64,7 +64,7 @@ class OutgoingImage:
         number: Number of its contact.
         contact: The contact record.
         stream: The codec's stream. All of it may be sent; its most valuable bytes go first.
-        curve: PSNR in dB by the number of bytes, see `quality_curve`.
+        curve: PSNR in dB by the number of bytes, see `usual_curve`.
         added_s: Time when it was added.
         image_id: Identifier on the vehicle.
         contact_id: Identifier of the contact on the vehicle.

@@ -1,7 +1,7 @@
 """Redundancy plan: the gain of the bytes of images, the layers of a group of images, and the number of symbols.
 
-Inputs are the measured loss and the codec's estimates of distortion. Nothing here is part of the wire format: receivers
-decode the frames of any plan.
+Inputs are the measured loss and the quality of images by the number of bytes. Nothing here is part of the wire format:
+receivers decode the frames of any plan.
 """
 
 from __future__ import annotations
@@ -23,35 +23,22 @@ from sonarpost.link.frames.v1.payload_objects import MAX_STREAM_BYTES
 
 Counts = npt.NDArray[np.int64]
 
-_PEAK_SQUARED: Final = 255.0**2
-_MIN_ERROR: Final = 0.065  # 60 dB
-_NO_IMAGE: Final = 3.0 * 55.0**2  # mean square error, against mid-grey, of an image that cannot be decoded at all
 _STEPS: Final = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 26, 34, 44, 63)
 _FIRST_TRIES: Final = 24
 _SURE: Final = 0.999
 
 
-def quality_curve(stream_bytes: int, mean_square_error: Sequence[float] | Values | None = None) -> Values:
+def usual_curve(stream_bytes: int) -> Values:
     """Return the PSNR in dB by the number of bytes received, shape (stream_bytes + 1,).
 
-    Args:
-        stream_bytes: Length of the stream.
-        mean_square_error: Error of the image that the first n bytes give, shape (stream_bytes + 1,), infinite if there
-            is none; the codec `emb` estimates it. By default 1.2 dB for every doubling, which is typical of codecs at
-            these rates.
+    1.2 dB for every doubling is typical of codecs at these rates.
 
     Raises:
-        StreamError: Another shape, or the stream is too long.
+        StreamError: The stream is too long.
     """
     if stream_bytes > MAX_STREAM_BYTES:
         raise StreamError("image", "stream", f"{stream_bytes} bytes", f"at most {MAX_STREAM_BYTES}")
-    if mean_square_error is None:
-        return 13.0 + 1.2 * np.log2(1.0 + np.arange(stream_bytes + 1) / 4.0)
-    error = np.asarray(mean_square_error, np.float64)
-    if error.shape != (stream_bytes + 1,) or np.isnan(error).any() or (error < 0).any():
-        raise StreamError("image", "mean square error", error.shape, f"{stream_bytes + 1} values of 0 or more")
-    error = np.minimum.accumulate(np.clip(error, _MIN_ERROR, _NO_IMAGE))
-    return 10.0 * np.log10(_PEAK_SQUARED / error)
+    return 13.0 + 1.2 * np.log2(1.0 + np.arange(stream_bytes + 1) / 4.0)
 
 
 def _hull(curve: Values, start: int) -> tuple[list[int], list[float]]:

@@ -17,7 +17,7 @@ from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.coding.block_window import FIRST_URGENCY, LAST_URGENCY
 from sonarpost.link.coding.blocks import OutgoingImage, SendBlock
 from sonarpost.link.coding.channel_capacity import LossChannel, RateSelector
-from sonarpost.link.coding.redundancy_plan import copies, quality_curve
+from sonarpost.link.coding.redundancy_plan import copies, usual_curve
 from sonarpost.link.config import QueueConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.v1.frame import SymbolKind
@@ -168,14 +168,13 @@ class TransmitQueue(ImageSender):
             image.contact,
             image.stream,
             now,
-            image.mean_square_error,
             image_id=image.image_id,
             contact_id=image.contact_id,
         )
         return True
 
     def _extend(self, known: OutgoingImage, image: ImageToSend, now: float) -> bool:
-        known.curve = quality_curve(len(image.stream), image.mean_square_error)
+        known.curve = usual_curve(len(image.stream))
         known.stream = image.stream
         return self.sender.refine(RefineRequest(known.number, min(len(image.stream), MAX_STREAM_BYTES)), now)
 

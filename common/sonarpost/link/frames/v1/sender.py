@@ -6,7 +6,6 @@ records.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Final
 
@@ -21,7 +20,7 @@ from sonarpost.link.coding.delivery_ledger import (
     missing_images,
     record_delivered,
 )
-from sonarpost.link.coding.redundancy_plan import copies, quality_curve, symbols_to_send
+from sonarpost.link.coding.redundancy_plan import copies, symbols_to_send, usual_curve
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import (
@@ -128,8 +127,8 @@ class V1Sender:
         contact: ContactSummary,
         stream: bytes,
         now: float,
-        mean_square_error: Sequence[float] | Values | None = None,
         *,
+        curve: Values | None = None,
         image_id: str = "0000",
         contact_id: str = "?",
     ) -> None:
@@ -140,20 +139,20 @@ class V1Sender:
             contact: The contact record.
             stream: Header and body, as much as may ever be sent.
             now: Seconds.
-            mean_square_error: See `quality_curve`.
+            curve: PSNR in dB by the number of bytes received, shape (len(stream) + 1,); None: see `usual_curve`.
             image_id: Identifier on the vehicle.
             contact_id: Identifier of the contact on the vehicle.
 
         Raises:
             FrameError: The number is out of range, or an image that waits has it.
-            StreamError: As `quality_curve`, or the stream is empty.
+            StreamError: The stream is empty or too long.
         """
         if not 1 <= number <= MAX_NUMBER or any(image.number == number for image in self.waiting):
             raise FrameError("acoustic link v1", "contact number", number, f"1..{MAX_NUMBER}, not one that waits")
         if not stream:
             raise StreamError("image", "stream", stream, "at least one byte")
         order = 1 + max((image.order for image in self.kept.values()), default=0)
-        curve = quality_curve(len(stream), mean_square_error)
+        curve = usual_curve(len(stream)) if curve is None else curve
         image = OutgoingImage(number, contact.rounded(), stream, curve, float(now), image_id, contact_id, order)
         self.waiting.append(image)
         self.kept.pop(number, None)
