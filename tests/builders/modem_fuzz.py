@@ -158,13 +158,11 @@ class Fuzz:
 
 
 def send_request(driver: MicroModem, kind: int, data: bytes, rate: int, now: float, *, ack: bool) -> int:
-    """Send a request of one of four kinds; return its number."""
+    """Send a request of one of three kinds; return its number."""
     match kind:
         case 0:
             return driver.ping(2, now)
         case 1:
-            return driver.send_mini(2, 5, now)
-        case 2:
             return driver.request_packet(2, rate, now=now)
         case _:
             return driver.send_packet(2, rate, [data], ack=ack, now=now)
@@ -180,7 +178,6 @@ def real_lines() -> list[bytes]:
         rig.drivers[1].send_packet(2, rate, [b"real"], ack=True, now=rig.now)
         rig.drivers[2].send_packet(1, rate, [b"back"], now=rig.now)
     rig.drivers[1].ping(2, rig.now)
-    rig.drivers[2].send_mini(1, 77, rig.now)
     rig.drivers[2].request_packet(1, 1, now=rig.now)
     rig.run(150.0)
     return [passed.line for passed in rig.transferred if passed.host == 1 and not passed.to_modem]

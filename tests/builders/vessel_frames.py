@@ -5,8 +5,7 @@ import numpy as np
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import Segment, SegmentKind, pack_segments
 from sonarpost.link.frames.v1.payload_objects import ENTRY_HEAD_BYTES, Preview
-from sonarpost.modem.interface import FrameReceived, PacketReceived
-from sonarpost.modem.micromodem import LinkStatistics
+from sonarpost.modem.interface import FrameReceived, PacketReceived, ReceptionQuality
 
 CONTACT = ContactSummary(height_px=40, width_px=60, lat_deg=56.4, lon_deg=-5.6, time_utc_s=1_475_568_000.0)
 
@@ -31,7 +30,7 @@ def packet(
     bad: int = 0,
     nframes: int | None = None,
     rate: int = 1,
-    statistics: LinkStatistics | None = None,
+    statistics: ReceptionQuality | None = None,
 ) -> PacketReceived:
     """Return a packet as the driver reports it; bytes become frames with consecutive numbers."""
     found = tuple(

@@ -13,13 +13,7 @@ from sonarpost.modem.interface import (
     PacketSent,
     SentenceRejected,
 )
-from sonarpost.modem.micromodem import (
-    FrameAcknowledged,
-    MicroModem,
-    MicroModemConfig,
-    ModemMessageReceived,
-    StatisticsReceived,
-)
+from sonarpost.modem.micromodem import MicroModem, MicroModemConfig
 
 CONFIG = MicroModemConfig(address=1)
 FRAMES = (b"first frame", b"second")
@@ -164,7 +158,7 @@ def test_packet_timeout_of_the_modem_ends_the_packet() -> None:
     for step in packet_steps(modem)[:3]:
         step()
     modem.send("CAMSG", "PACKET_TIMEOUT", 4)
-    assert [type(event) for event in modem.events] == [ModemMessageReceived]
+    assert modem.events == []
     modem.run(5.0 + CONFIG.statistics_timeout_s + 0.1)
     assert frames_of(modem) == [FRAMES[0]]
     assert not modem.events_of(PacketReceived)[0].complete
@@ -198,7 +192,7 @@ def test_rate_0_packet_has_a_header_with_its_own_statistics() -> None:
     modem.send("CARXP", 0)
     modem.send("CACYC", 0, 3, 1, 0, 0, 1)
     cst(modem, rate=0, nframes=0, packet_type=2)
-    assert [type(event) for event in modem.events] == [StatisticsReceived]
+    assert modem.events == []
     assert modem.driver.receiving
     modem.run(7.0)
     modem.send("CARXP", 0)
@@ -216,7 +210,7 @@ def test_acknowledgements_are_not_a_packet() -> None:
     modem.send("CAACK", 3, 1, 1, 1)
     modem.send("CAACK", 3, 1, 2, 0)
     cst(modem, nframes=0, packet_type=4)
-    assert [type(event) for event in modem.events] == [FrameAcknowledged, StatisticsReceived]
+    assert modem.events == []
     assert not modem.driver.receiving
 
 

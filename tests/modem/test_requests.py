@@ -1,4 +1,4 @@
-"""Requests of the driver: pings, mini-packets and polls."""
+"""Requests of the driver: pings and polls, and short packets of other modems."""
 
 import pytest
 
@@ -9,9 +9,11 @@ from sonarpost.modem.interface import (
     PacketReceived,
     PacketSent,
     PollReceived,
+    RangeMeasured,
     RequestDone,
     RequestFailed,
     SentenceRejected,
+    ShortMessageReceived,
     TransmissionEnded,
     TransmissionStarted,
 )
@@ -20,11 +22,6 @@ from sonarpost.modem.micromodem import (
     FailureReason,
     MicroModem,
     MicroModemConfig,
-    MiniPacketAnswered,
-    MiniPacketReceived,
-    PingAnswered,
-    PingReceived,
-    StatisticsReceived,
     nmea,
 )
 
@@ -51,12 +48,7 @@ def receive(driver: MicroModem, *texts: str, now: float = 1.0) -> list[object]:
 def test_unsolicited_short_packets_are_reported() -> None:
     driver = ready()
     events = receive(driver, "CAMPA,2,1", "CAMUA,2,1,1ABC", "CAMPR,2,1,0.1000", "CAMUR,2,1")
-    assert events == [
-        PingReceived(2, 1),
-        MiniPacketReceived(2, 1, 0x1ABC),
-        PingAnswered(2, 1, 0.1),
-        MiniPacketAnswered(2, 1),
-    ]
+    assert events == [ShortMessageReceived(2, 1, 0x1ABC), RangeMeasured(2, 1, 0.1)]
     (rejected,) = receive(driver, "CAMUA,2,1,FFFF")
     assert isinstance(rejected, SentenceRejected)
 
@@ -67,11 +59,8 @@ def test_bytes_and_events_of_each_request() -> None:
     driver.ping(2, 1.0)
     assert driver.bytes_to_send() == b"$CCMPC,1,2*5D\r\n"
     assert receive(driver, "CAMPC,1,2", "CATXP,0", "CATXF,0", "CARXP,0") == on_air
-    assert receive(driver, "CAMPR,2,1,0.0667") == [PingAnswered(2, 1, 0.0667), RequestDone(1, "ping", 2)]
-    assert any(isinstance(e, StatisticsReceived) for e in receive(driver, "CACST,6,0,20250606230123.348554"))
-    driver.send_mini(2, 5, 2.0)
-    assert driver.bytes_to_send().startswith(b"$CCMUC,1,2,0005*")
-    assert receive(driver, "CAMUR,2,1") == [MiniPacketAnswered(2, 1), RequestDone(2, "mini-packet", 2)]
+    assert receive(driver, "CAMPR,2,1,0.0667") == [RangeMeasured(2, 1, 0.0667), RequestDone(1, "ping", 2)]
+    assert receive(driver, "CACST,6,0,20250606230123.348554") == []
     driver.request_packet(2, 4, now=4.0)
     assert driver.bytes_to_send().startswith(b"$CCCYC,0,2,1,4,0,2*")
     assert receive(driver, "CACYC,0,2,1,4,0,2", "CATXP,0", "CATXF,0") == on_air
@@ -118,7 +107,6 @@ def test_reboot_or_lost_port_ends_a_request() -> None:
     ("command", "field"),
     [
         (lambda d: d.ping(128, 0.0), "address"),
-        (lambda d: d.send_mini(2, 0x2000, 0.0), "bits"),
         (lambda d: d.request_packet(2, 9, now=0.0), "rate"),
         (lambda d: d.request_packet(2, 1, 4, now=0.0), "frames"),
         (lambda d: d.request_packet(-1, 1, now=0.0), "address"),

@@ -8,29 +8,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.micromodem import (
-    LinkStatistics,
-    MiniPacketAnswered,
-    MiniPacketReceived,
-    PingAnswered,
-    PingReceived,
-    TransmitStatistics,
-    nmea,
-)
+from sonarpost.modem.interface import RangeMeasured, ShortMessageReceived
+from sonarpost.modem.micromodem import nmea
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.requests import mini_command, ping_command
+from sonarpost.modem.micromodem.requests import ping_command
 from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
     ConfigurationSetting,
     Cycle,
     DataRequest,
     ErrorReport,
-    ModemMessage,
+    LinkStatistics,
     ReceivedData,
     Revision,
     TransmitMark,
     accepted_bytes,
+    message_text,
+    range_measured,
+    short_message,
     transmit_data,
+    transmitted_type,
 )
 from sonarpost.modem.micromodem.supervisor import query_command, set_command
 
@@ -46,18 +43,11 @@ PARSED = [
     (b"$CAACK,1,3,2,1", Acknowledgement(1, 3, 2)),
     (b"$CAACK,1,3,2", Acknowledgement(1, 3, 2)),
     (b"$CAACK,1,3,2,0", Acknowledgement(1, 3, 2, good=False)),
-    (b"$CAMSG,BAD_CRC,2", ModemMessage("BAD_CRC", ("2",))),
-    (b"$CAMSG,PACKET_TIMEOUT,3", ModemMessage("PACKET_TIMEOUT", ("3",))),
     (b"$CACFG,SRC,1", ConfigurationSetting("SRC", "1")),
     (b"$CAREV,000052,AUV,0.93.0.09", Revision("AUV", "0.93.0.09")),
-    (b"$CAERR,181807,NMEA,2,no such command", ErrorReport("NMEA", 2, "no such command", "181807")),
-    (b"$CAERR,181807,NMEA,two,words", ErrorReport("NMEA", None, "two,words", "181807")),
-    (b"$CAERR,181807,DATA_TIMEOUT,2", ErrorReport("DATA_TIMEOUT", 2, "", "181807")),
-    (b"$CAMPA,1,2", PingReceived(1, 2)),
-    (b"$CAMPR,2,1,0.1234", PingAnswered(2, 1, 0.1234)),
-    (b"$CAMPR,2,1", PingAnswered(2, 1, None)),
-    (b"$CAMUA,1,2,1ABC", MiniPacketReceived(1, 2, 0x1ABC)),
-    (b"$CAMUR,2,1", MiniPacketAnswered(2, 1)),
+    (b"$CAERR,181807,NMEA,2,no such command", ErrorReport("NMEA", 2, "no such command")),
+    (b"$CAERR,181807,NMEA,two,words", ErrorReport("NMEA", None, "two,words")),
+    (b"$CAERR,181807,DATA_TIMEOUT,2", ErrorReport("DATA_TIMEOUT", 2)),
 ]
 
 
@@ -75,15 +65,26 @@ def test_sentence_of_the_modem_is_parsed(line: bytes, record) -> None:
         (set_command("SRC", 1).sentence, b"$CCCFG,SRC,1"),
         (query_command("SRC", 1).sentence, b"$CCCFQ,SRC"),
         (ping_command(1, 2), b"$CCMPC,1,2"),
-        (mini_command(1, 2, 0xABC), b"$CCMUC,1,2,0ABC"),
     ],
 )
 def test_bytes_of_each_command(sentence: Sentence, line: bytes) -> None:
     assert sentence.encode().partition(b"*")[0] == line
 
 
-def test_accepted_bytes() -> None:
-    assert accepted_bytes(nmea.parse(b"$CATXD,2,1,0,3")) == 3
+@pytest.mark.parametrize(
+    ("line", "parse", "value"),
+    [
+        (b"$CATXD,2,1,0,3", accepted_bytes, 3),
+        (b"$CAMSG,BAD_CRC,2", message_text, "BAD_CRC"),
+        (b"$CAMPR,2,1,0.1234", range_measured, RangeMeasured(2, 1, 0.1234)),
+        (b"$CAMPR,2,1", range_measured, RangeMeasured(2, 1, None)),
+        (b"$CAMUA,1,2,1ABC", short_message, ShortMessageReceived(1, 2, 0x1ABC)),
+        (b"$CAXST,7,20250606,230117.336548,3,0,200,5000,25000,1,0,0,0,0,8,5,28,25000*66", transmitted_type, 5),
+        (b"$CAXST,7,20250606,230117.336548", transmitted_type, None),
+    ],
+)
+def test_sentence_with_one_result(line: bytes, parse: Callable[[Sentence], object], value: object) -> None:
+    assert parse(nmea.parse(line)) == value
 
 
 def test_echo_has_the_fields_of_the_command() -> None:
@@ -107,21 +108,19 @@ def test_echo_has_the_fields_of_the_command() -> None:
         (b"$CATXD,128,1,0,1", accepted_bytes, "src"),
         (b"$CATXF,x", TransmitMark.parse, "nbytes"),
         (b"$CAACK,1,3,0,1", Acknowledgement.parse, "frame"),
-        (b"$CAMSG,", ModemMessage.parse, "text"),
+        (b"$CAMSG,", message_text, "text"),
         (b"$CACFG,,1", ConfigurationSetting.parse, "name"),
         (b"$CAREV,000052,", Revision.parse, "role"),
         (b"$CACST,8,x", LinkStatistics.parse, "mode"),
-        (b"$CACST,8,0,,,one", LinkStatistics.parse, "mfd_peak"),
+        (b"$CACST,8,0,,,,,,one", LinkStatistics.parse, "spl_db"),
         (b"$CACST,8,0" + b"," * 19 + b",nan", LinkStatistics.parse, "snr_in_db"),
-        (b"$CAXST,7,20250606", TransmitStatistics.parse, "fields"),
-        (b"$CAXST,7,20250606,230117,3,0,200,1e999", TransmitStatistics.parse, "bandwidth_hz"),
+        (b"$CAXST,7,20250606", transmitted_type, "fields"),
+        (b"$CAXST,7,20250606,230117" + b"," * 12 + b"x", transmitted_type, "packet_type"),
         (b"$CATXF,28", Cycle.parse, "kind"),
-        (b"$CAMPA,1", PingReceived.parse, "fields"),
-        (b"$CAMPA,1,128", PingReceived.parse, "dest"),
-        (b"$CAMPR,1,2,soon", PingAnswered.parse, "travel time"),
-        (b"$CAMPR,1,2,-1", PingAnswered.parse, "travel time"),
-        (b"$CAMUA,1,2,2000", MiniPacketReceived.parse, "bits"),
-        (b"$CAMUA,1,2,", MiniPacketReceived.parse, "bits"),
+        (b"$CAMPR,1,2,soon", range_measured, "travel time"),
+        (b"$CAMPR,1,2,-1", range_measured, "travel time"),
+        (b"$CAMUA,1,2,2000", short_message, "bits"),
+        (b"$CAMUA,1,2,", short_message, "bits"),
     ],
 )
 def test_error_names_the_invalid_field(line: bytes, parse: Callable[[Sentence], object], field: str) -> None:
@@ -134,10 +133,8 @@ def test_error_names_the_invalid_field(line: bytes, parse: Callable[[Sentence], 
 PARSERS: dict[str, Callable[[Sentence], object]] = {
     "CACYC": Cycle.parse, "CADRQ": DataRequest.parse, "CATXD": accepted_bytes, "CATXP": TransmitMark.parse,
     "CARXD": ReceivedData.parse, "CAACK": Acknowledgement.parse,
-    "CAMSG": ModemMessage.parse, "CACFG": ConfigurationSetting.parse, "CAREV": Revision.parse,
-    "CAERR": ErrorReport.parse, "CAMPA": PingReceived.parse,
-    "CAMPR": PingAnswered.parse, "CAMUA": MiniPacketReceived.parse, "CAMUR": MiniPacketAnswered.parse,
-    "CACST": LinkStatistics.parse, "CAXST": TransmitStatistics.parse,
+    "CAMSG": message_text, "CACFG": ConfigurationSetting.parse, "CAREV": Revision.parse,
+    "CAERR": ErrorReport.parse, "CAMPR": range_measured, "CAMUA": short_message, "CACST": LinkStatistics.parse,
 }  # fmt: skip
 awkward = st.sampled_from(
     ["", " ", "0", "1", "-1", "1_0", "0x1", "1e5", "nan", "inf", "-", ".", "AB", "9" * 30, "\u0661", "1;2;AABB"]
@@ -159,14 +156,9 @@ GOLDEN_CST = nmea.parse(
 
 def test_golden_link_statistics() -> None:
     got = LinkStatistics.parse(GOLDEN_CST)
-    assert (got.version, got.mode, got.good, got.clock) == (8, 0, True, "06")
-    assert got.arrival_time == "20250606230123.348554"
-    assert (got.mfd_peak, got.mfd_power_db, got.mfd_ratio, got.spl_db, got.agn) == (32767, 45, 102, 123, 7)
-    assert (got.rate, got.src, got.dest, got.psk_error, got.packet_type) == (1, 1, 0, 0, 5)
-    assert (got.nframes, got.nbad, got.snr_rss_db, got.snr_in_db, got.snr_out_db) == (1, 0, 150.0, 26.0, 9.48)
-    assert (got.snr_symbol_db, got.mse_db, got.dqf, got.doppler) == (-100.0, -6.48, -1, 0.01)
-    assert (got.noise_db, got.carrier_hz, got.bandwidth_hz) == (51.0, 25000.0, 5000.0)
-    assert got.more == ("0", "-1", "-1", "00")
+    assert (got.mode, got.good, got.spl_db, got.rate, got.src, got.dest, got.packet_type) == (0, True, 123, 1, 1, 0, 5)
+    assert (got.nframes, got.nbad, got.snr_in_db, got.snr_out_db) == (1, 0, 26.0, 9.48)
+    assert (got.mse_db, got.doppler) == (-6.48, 0.01)
 
 
 @pytest.mark.parametrize("kept", range(2, len(GOLDEN_CST.fields) + 1))
@@ -175,28 +167,13 @@ def test_missing_statistics_fields_are_none(kept: int) -> None:
     got = LinkStatistics.parse(Sentence("CACST", GOLDEN_CST.fields[:kept]))
     assert got.mode == whole.mode
     assert got.nframes == (whole.nframes if kept >= 19 else None)
-    assert got.bandwidth_hz == (whole.bandwidth_hz if kept >= 30 else None)
-    assert got.more == whole.more[: max(0, kept - 30)]
+    assert got.doppler == (whole.doppler if kept >= 27 else None)
 
 
-def test_additional_statistics_fields_are_kept() -> None:
-    longer = Sentence("CACST", (*GOLDEN_CST.fields, "new", "fields"))
-    assert LinkStatistics.parse(longer).more == ("0", "-1", "-1", "00", "new", "fields")
-
-
-def test_statistics_of_old_firmware_have_no_version() -> None:
-    got = LinkStatistics.parse(Sentence("CACST", ("0", "181807.1234", "3", *GOLDEN_CST.fields[4:])))
-    assert (got.version, got.mode, got.mfd_peak, got.bandwidth_hz) == (None, 0, 32767, 5000.0)
-    assert got.arrival_time == "181807.1234"
-
-
-def test_golden_transmit_statistics() -> None:
-    sentence = nmea.parse(b"$CAXST,7,20250606,230117.336548,3,0,200,5000,25000,1,0,0,0,0,8,5,28,25000*66")
-    got = TransmitStatistics.parse(sentence)
-    assert (got.version, got.date, got.time, got.clock, got.mode) == (7, "20250606", "230117.336548", "3", 0)
-    assert (got.probe_length, got.bandwidth_hz, got.carrier_hz, got.rate) == (200, 5000.0, 25000.0, 1)
-    assert (got.src, got.dest, got.ack) == (0, 0, 0)
-    assert (got.frames_expected, got.frames_sent, got.packet_type, got.nbytes, got.more) == (0, 8, 5, 28, ("25000",))
+def test_statistics_of_old_and_newer_firmware() -> None:
+    whole = LinkStatistics.parse(GOLDEN_CST)
+    assert LinkStatistics.parse(Sentence("CACST", (*GOLDEN_CST.fields, "new", "fields"))) == whole
+    assert LinkStatistics.parse(Sentence("CACST", ("0", "181807.1234", "3", *GOLDEN_CST.fields[4:]))) == whole
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from sonarpost.modem.interface import (
     PacketFailed,
     PacketReceived,
     PacketSent,
+    RangeMeasured,
     RequestDone,
     SentenceRejected,
 )
@@ -26,8 +27,6 @@ from sonarpost.modem.micromodem import (
     FailureReason,
     MicroModem,
     MicroModemConfig,
-    MiniPacketReceived,
-    PingAnswered,
     nmea,
 )
 from sonarpost.modem.registry import ModemSettings
@@ -238,7 +237,7 @@ def test_timers_run_without_a_byte_from_the_port(tmp_path):
     assert events[0].attempts == 3
 
 
-def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path):
+def test_two_runners_ping_and_poll(tmp_path):
     modems = (ModemSite(address=1), ModemSite(address=2, east_m=150.0))
     channel = ChannelEmulator(EmulatorConfig(modem=modems, pty_dir=tmp_path / "modems", time_scale=150.0))
     channel.start()
@@ -256,16 +255,14 @@ def test_two_runners_ping_poll_and_exchange_short_packets(tmp_path):
         eventually(lambda: all(runner.ready for runner in runners.values()))
         requests = [
             runners[1].request(lambda driver, now: driver.ping(2, now)),
-            runners[1].request(lambda driver, now: driver.send_mini(2, 0x123, now)),
             runners[1].request_packet(2, 1),
         ]
         eventually(lambda: len([e for e in events[1] if isinstance(e, RequestDone)]) == len(requests))
         assert [e.request_id for e in events[1] if isinstance(e, RequestDone)] == requests
-        assert [e.travel_s for e in events[1] if isinstance(e, PingAnswered)] == [0.1]
+        assert [e.travel_s for e in events[1] if isinstance(e, RangeMeasured)] == [0.1]
         assert [e.data for e in events[1] if isinstance(e, FrameReceived)] == [b"polled"]
-        assert [e.bits for e in events[2] if isinstance(e, MiniPacketReceived)] == [0x123]
         with pytest.raises(FrameError):
-            runners[1].request(lambda driver, now: driver.send_mini(2, 0x2000, now))
+            runners[1].request(lambda driver, now: driver.ping(200, now))
     finally:
         for runner in runners.values():
             runner.stop()

@@ -113,41 +113,19 @@ class ModemCapabilities:
                 raise FrameError(where, f"length of frame {number}", len(frame), expected)
 
 
-class ReceptionQuality(Protocol):
-    """Measurements of a received packet; None where the modem does not report a value."""
-
-    @property
-    def snr_in_db(self) -> float | None:
-        """SNR at the receiver's input, dB."""
-
-    @property
-    def snr_out_db(self) -> float | None:
-        """SNR after equalisation, dB."""
-
-    @property
-    def spl_db(self) -> float | None:
-        """Sound pressure level, dB re 1 µPa."""
-
-    @property
-    def mse_db(self) -> float | None:
-        """Mean squared error of the equalizer, dB."""
-
-    @property
-    def doppler(self) -> float | None:
-        """Doppler, in the modem's own unit."""
-
-    @property
-    def nframes(self) -> int | None:
-        """Number of frames in the packet."""
-
-    @property
-    def nbad(self) -> int | None:
-        """Number of frames that failed their check."""
-
-
 @dataclass(frozen=True, slots=True)
-class PlainQuality:
-    """Measurements of a modem that reports a few of them; see `ReceptionQuality`."""
+class ReceptionQuality:
+    """Measurements of a received packet; None where the modem does not report a value.
+
+    Attributes:
+        snr_in_db: SNR at the receiver's input, dB.
+        snr_out_db: SNR after equalisation, dB.
+        spl_db: Sound pressure level, dB re 1 µPa.
+        mse_db: Mean squared error of the equalizer, dB.
+        doppler: Doppler, in the modem's own unit.
+        nframes: Number of frames in the packet.
+        nbad: Number of frames that failed their check.
+    """
 
     snr_in_db: float | None = None
     snr_out_db: float | None = None

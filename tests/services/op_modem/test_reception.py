@@ -22,8 +22,8 @@ from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
 from sonarpost.link.receiver import ImageUpdate
 from sonarpost.messages import AcousticFrame
-from sonarpost.modem.interface import FrameDecoded
-from sonarpost.modem.micromodem import LinkStatistics, nmea
+from sonarpost.modem.interface import FrameDecoded, ReceptionQuality
+from sonarpost.modem.micromodem import nmea
 from sonarpost.services.op_modem import reception
 from sonarpost.services.op_modem.reception import quality_of
 
@@ -195,7 +195,7 @@ def test_invalid_frames_are_quarantined_and_block_nothing(begin, decompressor, o
 
 def test_impossible_statistics_are_published_as_unknown(begin, observed):
     service = begin()
-    odd = LinkStatistics(mode=0, arrival_time="", clock="", nframes=-5, nbad=-1, snr_in_db=7.5)
+    odd = ReceptionQuality(nframes=-5, nbad=-1, snr_in_db=7.5)
     service.on_modem_event(packet(received(b"good", rate=77), nframes=200, rate=77, statistics=odd))
     eventually(lambda: len(observed()) == 1)
     [got] = observed()
@@ -209,7 +209,7 @@ real = st.none() | st.floats(allow_nan=False, allow_infinity=False)
 
 @given(snr_in_db=real, snr_out_db=real, spl_db=number, mse_db=real, doppler=real, nframes=number, nbad=number)
 def test_every_measurement_of_a_modem_fits_the_record(**measured):
-    quality = quality_of(LinkStatistics(mode=0, arrival_time="", clock="", **measured))
+    quality = quality_of(ReceptionQuality(**measured))
     assert quality.snr_in_db == measured["snr_in_db"]
     assert quality.frames is None or quality.frames == measured["nframes"] >= 0
 

@@ -38,8 +38,8 @@ from sonarpost.modem.interface import (
     PacketFailed,
     PacketReceived,
     PacketSent,
-    PlainQuality,
     RangeMeasured,
+    ReceptionQuality,
     RequestDone,
     RequestFailed,
     SentenceRejected,
@@ -474,7 +474,7 @@ class S2cModem(QueueingModem[Sending, RawMessage]):
         starts = range(0, max(1, len(received.data)), BURST_FRAME_BYTES)
         parts = [received.data[start : start + BURST_FRAME_BYTES] for start in starts]
         source, destination = received.source, received.destination
-        quality = PlainQuality(doppler=received.velocity_mps, nframes=len(parts), nbad=0)
+        quality = ReceptionQuality(doppler=received.velocity_mps, nframes=len(parts), nbad=0)
         frames = tuple(
             FrameReceived(source, destination, received.ack, number, part, now, rate, quality)
             for number, part in enumerate(parts, start=1)

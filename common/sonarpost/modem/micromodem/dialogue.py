@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.interface import (
+    ModemError,
     ModemEvent,
     PacketFailed,
     PacketReceived,
@@ -18,29 +19,26 @@ from sonarpost.modem.interface import (
     TransmissionStarted,
 )
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import FailureReason, FrameAcknowledged, MicroModemError, UnhandledSentence
 from sonarpost.modem.micromodem.nmea import FieldReader, Sentence
 from sonarpost.modem.micromodem.rates import CAPABILITIES, RATES
 from sonarpost.modem.micromodem.reception import CarrierSense, ReceptionTracker
-from sonarpost.modem.micromodem.requests import ModemRequest, RequestExchange, RequestKind
+from sonarpost.modem.micromodem.requests import FailureReason, ModemRequest, RequestExchange, RequestKind
 from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
     ConfigurationSetting,
     Cycle,
     DataRequest,
     ErrorReport,
-    MiniPacketAnswered,
-    MiniPacketReceived,
-    ModemMessage,
-    PingAnswered,
-    PingReceived,
     ReceivedData,
     Revision,
     TransmitMark,
     accepted_bytes,
+    message_text,
+    range_measured,
+    short_message,
     transmit_data,
+    transmitted_type,
 )
-from sonarpost.modem.micromodem.statistics import TransmitStatistics
 from sonarpost.modem.micromodem.supervisor import ModemSupervisor, Phase, TransmitMonitor
 from sonarpost.modem.micromodem.transmit_cycle import TransmitCycle
 from sonarpost.modem.packet_queue import WaitingPacket
@@ -112,8 +110,10 @@ class Dialogue:
     def handle(self, sentence: Sentence, now: float) -> None:
         """Process a sentence of the modem. One with a wrong field is reported as an event."""
         self.supervisor.note_sentence(now)
+        handler = self._HANDLERS.get(sentence.kind)
         try:
-            self._HANDLERS.get(sentence.kind, Dialogue._on_other)(self, sentence, now)
+            if handler is not None:
+                handler(self, sentence, now)
         except SentenceError as error:
             self.events.append(SentenceRejected(error))
 
@@ -153,9 +153,6 @@ class Dialogue:
                 if isinstance(event, PacketReceived):
                     self._request.on_answer(RequestKind.POLL, event.src)
 
-    def _on_other(self, sentence: Sentence, now: float) -> None:
-        self.events.append(UnhandledSentence(sentence))
-
     def _on_revision(self, sentence: Sentence, now: float) -> None:
         revision = Revision.parse(sentence)
         if revision.rebooted:
@@ -168,7 +165,7 @@ class Dialogue:
             return
         if self._request is not None:
             self._request.on_setting(now)
-        self.events += self.supervisor.on_setting(sentence, now)
+        self.supervisor.on_setting(sentence, now)
         if was_ready and not self.supervisor.ready:
             self.abort(FailureReason.REBOOTED, now)
 
@@ -180,23 +177,22 @@ class Dialogue:
             self._request.on_echo("CYC", now)
         elif cycle.src != self._config.address:
             self._on_reception(self.reception.on_cycle(cycle, now))
-        elif not self._start_polled(cycle, now):
-            self.events.append(UnhandledSentence(sentence))
+        else:
+            self._start_polled(cycle, now)
 
-    def _start_polled(self, cycle: Cycle, now: float) -> bool:
-        """Start the cycle that answers a poll; return whether the poll can be answered."""
+    def _start_polled(self, cycle: Cycle, now: float) -> None:
+        """Start the cycle that answers a poll, if it can be answered."""
         if self.poll_handler is None or self._cycle is not None or cycle.rate not in RATES or cycle.nframes < 1:
-            return False
+            return
         rate = RATES[cycle.rate]
         poll = PollReceived(cycle.dest, cycle.rate, min(cycle.nframes, rate.frames), rate.frame_bytes, cycle.ack)
         self.events.append(poll)
         frames = tuple(bytes(frame) for frame in self.poll_handler(poll))
         if not frames:
-            return True
+            return
         CAPABILITIES.check_packet(poll.dest, poll.rate, frames)
         packet = WaitingPacket(self._next_number(), poll.dest, poll.rate, frames, poll.ack, now)
         self._cycle = TransmitCycle(packet, self._config, self._send, now, polled=cycle)
-        return True
 
     def _on_request(self, sentence: Sentence, now: float) -> None:
         request = DataRequest.parse(sentence)
@@ -222,16 +218,14 @@ class Dialogue:
             self._carrier.on_transmission(mark, now)
 
     def _on_transmit_statistics(self, sentence: Sentence, now: float) -> None:
-        statistics: TransmitStatistics | None = None
+        packet_type: int | None = None
         try:
-            statistics = TransmitStatistics.parse(sentence)
+            packet_type = transmitted_type(sentence)
         except SentenceError as error:
             # Invalid statistics still mark the end of the transmission.
             self.events.append(SentenceRejected(error))
         if self.exchange is not None:
-            self.exchange.on_statistics(statistics, now)
-        else:
-            self.events.append(UnhandledSentence(sentence))
+            self.exchange.on_statistics(packet_type, now)
 
     def _on_reception_started(self, sentence: Sentence, now: float) -> None:
         FieldReader(sentence).optional_integer(0, "type", 0, 255)
@@ -241,9 +235,9 @@ class Dialogue:
         self._on_reception(self.reception.on_frame(ReceivedData.parse(sentence), now))
 
     def _on_message(self, sentence: Sentence, now: float) -> None:
-        message = ModemMessage.parse(sentence)
-        self._on_reception(self.reception.on_message(message, now))
-        if message.text == "PACKET_TIMEOUT" and self._request is not None:
+        text = message_text(sentence)
+        self.reception.on_message(text, now)
+        if text == "PACKET_TIMEOUT" and self._request is not None:
             self._request.on_no_answer()
 
     def _on_link_statistics(self, sentence: Sentence, now: float) -> None:
@@ -253,31 +247,24 @@ class Dialogue:
         if self._request is not None:
             self._request.on_echo(sentence.kind[2:], now)
 
-    def _on_ping_received(self, sentence: Sentence, now: float) -> None:
-        self.events.append(PingReceived.parse(sentence))
-
-    def _on_answer(self, sentence: Sentence, now: float) -> None:
-        is_ping = sentence.kind == "CAMPR"
-        answer = PingAnswered.parse(sentence) if is_ping else MiniPacketAnswered.parse(sentence)
+    def _on_ping_answer(self, sentence: Sentence, now: float) -> None:
+        answer = range_measured(sentence)
         if self._request is not None:
-            self._request.on_answer(RequestKind.PING if is_ping else RequestKind.MINI_PACKET, answer.src)
+            self._request.on_answer(RequestKind.PING, answer.src)
         self.events.append(answer)
 
     def _on_mini_received(self, sentence: Sentence, now: float) -> None:
-        self.events.append(MiniPacketReceived.parse(sentence))
+        self.events.append(short_message(sentence))
 
     def _on_acknowledgement(self, sentence: Sentence, now: float) -> None:
         acknowledgement = Acknowledgement.parse(sentence)
         self.reception.on_acknowledgement(now)
         if self._cycle is not None:
             self._cycle.on_acknowledgement(acknowledgement, now)
-        if acknowledgement.good:
-            a = acknowledgement
-            self.events.append(FrameAcknowledged(a.src, a.dest, a.frame_number))
 
     def _on_error(self, sentence: Sentence, now: float) -> None:
         report = ErrorReport.parse(sentence)
-        self.events.append(MicroModemError(report.text, report))
+        self.events.append(ModemError(report.text))
         self.supervisor.on_error(report, now)
         if self.exchange is not None:
             self.exchange.on_error(report, now)
@@ -299,9 +286,6 @@ class Dialogue:
         "CAACK": _on_acknowledgement,
         "CAERR": _on_error,
         "CAMPC": _on_request_echo,
-        "CAMUC": _on_request_echo,
-        "CAMPA": _on_ping_received,
-        "CAMPR": _on_answer,
+        "CAMPR": _on_ping_answer,
         "CAMUA": _on_mini_received,
-        "CAMUR": _on_answer,
     }

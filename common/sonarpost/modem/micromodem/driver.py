@@ -17,13 +17,12 @@ from sonarpost.errors import SentenceError
 from sonarpost.modem.interface import Modem, ModemCapabilities, ModemEvent, PollHandler, SentenceRejected
 from sonarpost.modem.micromodem.config import MicroModemConfig
 from sonarpost.modem.micromodem.dialogue import Dialogue
-from sonarpost.modem.micromodem.events import FailureReason
 from sonarpost.modem.micromodem.nmea import LineAssembler, Sentence
 from sonarpost.modem.micromodem.rates import CAPABILITIES
 from sonarpost.modem.micromodem.requests import (
+    FailureReason,
     ModemRequest,
     RequestKind,
-    mini_command,
     ping_command,
     poll_command,
 )
@@ -105,21 +104,12 @@ class MicroModem(Modem):
 
     @override
     def ping(self, destination: int, now: float) -> int:
-        """Queue a ping; `PingAnswered` carries the travel time, `RequestDone` or `RequestFailed` the result.
+        """Queue a ping; `RangeMeasured` carries the travel time, `RequestDone` or `RequestFailed` the result.
 
         Raises:
             FrameError: An address outside 0..127.
         """
         return self._enqueue_request(RequestKind.PING, destination, ping_command(self.config.address, destination), now)
-
-    def send_mini(self, destination: int, bits: int, now: float) -> int:
-        """Queue a user mini-packet of 13 bits; `RequestDone` or `RequestFailed` carries the result.
-
-        Raises:
-            FrameError: An address outside 0..127, or more than 13 bits.
-        """
-        command = mini_command(self.config.address, destination, bits)
-        return self._enqueue_request(RequestKind.MINI_PACKET, destination, command, now)
 
     @override
     def request_packet(

@@ -15,10 +15,8 @@ from sonarpost.modem.interface import (
     SentenceRejected,
 )
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import ModemMessageReceived, StatisticsReceived
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.sentences import Cycle, ModemMessage, ReceivedData, TransmitMark
-from sonarpost.modem.micromodem.statistics import LinkStatistics
+from sonarpost.modem.micromodem.sentences import Cycle, LinkStatistics, ReceivedData, TransmitMark
 
 FSK_MINI_PACKET = 2
 """Packet type of rate 0 headers, acknowledgements, pings and mini-packets in `CACST` and `CAXST`."""
@@ -144,17 +142,15 @@ class ReceptionTracker:
         self._extend(reception, now)
         return [*events, FrameDecoded(frame)]
 
-    def on_message(self, message: ModemMessage, now: float) -> list[ModemEvent]:
+    def on_message(self, text: str, now: float) -> None:
         """Process `CAMSG`: a damaged frame, a time-out, or another message."""
-        if message.text == "BAD_CRC":
+        if text == "BAD_CRC":
             reception = self._open(now)
             reception.bad_frames += 1
             self._extend(reception, now)
-            return []
-        if message.text == "PACKET_TIMEOUT" and self.reception is not None:
+        elif text == "PACKET_TIMEOUT" and self.reception is not None:
             self.reception.timed_out = True
             self.reception.deadline_s = now + self._config.statistics_timeout_s
-        return [ModemMessageReceived(message)]
 
     def on_acknowledgement(self, now: float) -> None:
         """Process `CAACK`: the packet carries acknowledgements."""
@@ -168,14 +164,14 @@ class ReceptionTracker:
         except SentenceError as error:
             return [*self._close(None, ended=True), SentenceRejected(error)]
         if self.reception is None:
-            return [StatisticsReceived(statistics)]
+            return []
         if self.reception.is_header(statistics):
             self._restart(self.reception, now)
-            return [StatisticsReceived(statistics)]
+            return []
         damaged_data = bool(statistics.nbad) and statistics.packet_type not in _WITHOUT_CYCLE
         if not self.reception.announced and not damaged_data:
             self.reception = None
-            return [StatisticsReceived(statistics)]
+            return []
         return self._close(statistics, ended=True)
 
     def poll(self, now: float) -> list[ModemEvent]:

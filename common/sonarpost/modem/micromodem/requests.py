@@ -1,4 +1,4 @@
-"""Requests other than data packets: pings, mini-packets, and polls of other modems.
+"""Requests other than data packets: pings, and polls of other modems.
 
 A request waits for the modem's echo, for the end of the transmission and for the answer of the far modem. Every wait is
 limited, and a later sentence implies the earlier ones that were lost. The functions that build commands raise
@@ -9,23 +9,38 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum, auto
+from enum import Enum, StrEnum, auto
 
 from sonarpost.errors import FrameError
 from sonarpost.modem.interface import RequestDone, RequestFailed
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import FailureReason
 from sonarpost.modem.micromodem.nmea import MAX_ADDRESS, Sentence
 from sonarpost.modem.micromodem.rates import RATES
-from sonarpost.modem.micromodem.sentences import MAX_MINI_BITS, Cycle, ErrorReport, TransmitMark
-from sonarpost.modem.micromodem.statistics import TransmitStatistics
+from sonarpost.modem.micromodem.sentences import Cycle, ErrorReport, TransmitMark
+
+
+class FailureReason(StrEnum):
+    """Why a packet or request failed."""
+
+    NO_ECHO = "no echo of the command (CACYC)"
+    NO_DATA_REQUEST = "no data request for a frame (CADRQ)"
+    NO_DATA_ECHO = "no confirmation of a frame's data (CATXD)"
+    NO_TRANSMIT_START = "no start of the transmission (CATXP)"
+    NO_TRANSMIT_END = "no end of the transmission (CATXF)"
+    DATA_TIMEOUT = "the modem continued without the data of a frame"
+    FRAME_REFUSED = "the modem accepts fewer bytes than the frame has"
+    REBOOTED = "the modem restarted during the exchange"
+    PORT_LOST = "the port to the modem was lost"
+    QUEUE_FULL = "the driver's queue is full"
+    NO_ANSWER = "no answer from the far modem"
+    REFUSED = "the modem rejected the command"
+    DEFERRED_TOO_LONG = "the modem or the channel was busy for too long"
 
 
 class RequestKind(Enum):
     """Kind of a request."""
 
     PING = "ping"
-    MINI_PACKET = "mini-packet"
     POLL = "poll"
 
 
@@ -34,7 +49,7 @@ class ModemRequest:
     """A queued request.
 
     Attributes:
-        rate: Rate number; 0 for pings and mini-packets.
+        rate: Rate number; 0 for pings.
     """
 
     request_id: int
@@ -53,14 +68,6 @@ def ping_command(src: int, dest: int) -> Sentence:
     """Return `CCMPC,src,dest`."""
     _check_address("ping", dest)
     return Sentence("CCMPC", (str(src), str(dest)))
-
-
-def mini_command(src: int, dest: int, bits: int) -> Sentence:
-    """Return `CCMUC,src,dest,HHHH`."""
-    _check_address("mini-packet", dest)
-    if not 0 <= bits <= MAX_MINI_BITS:
-        raise FrameError("mini-packet", "bits", bits, f"0..{MAX_MINI_BITS}")
-    return Sentence("CCMUC", (str(src), str(dest), f"{bits:04X}"))
 
 
 def poll_command(src: int, dest: int, rate: int, frames: int | None, *, ack: bool) -> Sentence:
@@ -123,13 +130,13 @@ class RequestExchange:
         elif self._stage in {_Stage.ECHO, _Stage.ON_AIR} and mark.ends:
             self._transmitted(now)
 
-    def on_statistics(self, _statistics: TransmitStatistics | None, now: float) -> None:
+    def on_statistics(self, _packet_type: int | None, now: float) -> None:
         """Process `CAXST`, which implies the end of the transmission."""
         if self._stage is _Stage.ON_AIR:
             self._transmitted(now)
 
     def on_answer(self, kind: RequestKind, src: int | None) -> None:
-        """Process an answer of the far modem: to a ping or mini-packet, or the packet of a poll."""
+        """Process an answer of the far modem: to a ping, or the packet of a poll."""
         if kind is self.request.kind and src == self.request.peer and self._stage is not _Stage.OVER:
             self._finish()
 

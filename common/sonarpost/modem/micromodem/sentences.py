@@ -1,4 +1,4 @@
-"""Typed sentences of the Micro-Modem, except its statistics.
+"""Typed sentences of the Micro-Modem.
 
 `parse` reads a `Sentence` or raises `SentenceError` with kind, field, value and expectation. `CC` sentences go from
 host to modem, `CA` sentences from modem to host. Addresses are 0..127, frame numbers start at 1, binary data is hex.
@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass
 
 from sonarpost.errors import SentenceError
-from sonarpost.modem.interface import ModemEvent, RangeMeasured, ShortMessageReceived
+from sonarpost.modem.interface import RangeMeasured, ReceptionQuality, ShortMessageReceived
 from sonarpost.modem.micromodem.nmea import FieldReader, Sentence
 
 MAX_MINI_BITS = 0x1FFF
@@ -23,6 +23,14 @@ _MAX_SETTING = 2**31
 _MAX_TRAVEL_S = 3600.0
 _SETTING_INTEGER = re.compile(r"[+-]?[0-9]{1,10}")
 _MINI_BITS = re.compile(r"[0-9A-Fa-f]{1,4}")
+
+_FIRST_VERSIONED = 6
+"""First version of `CACST` that includes its version."""
+_INTEGER_STATISTICS = {
+    "spl_db": 6, "rate": 12, "src": 13, "dest": 14, "packet_type": 16, "nframes": 17, "nbad": 18,
+}  # fmt: skip
+_REAL_STATISTICS = {"snr_in_db": 20, "snr_out_db": 21, "mse_db": 23, "doppler": 25}
+"""Fields of `CACST` that the driver uses, by their index after the version."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,17 +161,9 @@ class Acknowledgement:
         return cls(read.address(0, "src"), read.address(1, "dest"), frame_number, good)
 
 
-@dataclass(frozen=True, slots=True)
-class ModemMessage:
-    """`CAMSG,text,…`: BAD_CRC for a damaged frame, PACKET_TIMEOUT for an incomplete packet, and others."""
-
-    text: str
-    details: tuple[str, ...] = ()
-
-    @classmethod
-    def parse(cls, sentence: Sentence) -> ModemMessage:
-        """Read `CAMSG`."""
-        return cls(FieldReader(sentence, ("CAMSG",), 1).name(0, "text"), sentence.fields[1:])
+def message_text(sentence: Sentence) -> str:
+    """Return the first field of `CAMSG`: BAD_CRC for a damaged frame, PACKET_TIMEOUT for an incomplete packet."""
+    return FieldReader(sentence, ("CAMSG",), 1).name(0, "text")
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,13 +217,11 @@ class ErrorReport:
         module: Module of the modem that reports the error, or DATA_TIMEOUT.
         number: Error number or, for DATA_TIMEOUT, the frame without data; None where it is not an integer.
         message: The remaining fields, as text.
-        modem_time: hhmmss of the modem's clock.
     """
 
     module: str
     number: int | None = None
     message: str = ""
-    modem_time: str = ""
 
     @property
     def text(self) -> str:
@@ -240,8 +238,8 @@ class ErrorReport:
         try:
             number = read.optional_integer(2, "errno", -_MAX_SETTING, _MAX_SETTING)
         except SentenceError:
-            return cls(module, None, ",".join(rest), read.text(0))
-        return cls(module, number, ",".join(rest[1:]), read.text(0))
+            return cls(module, None, ",".join(rest))
+        return cls(module, number, ",".join(rest[1:]))
 
     @property
     def data_timeout(self) -> bool:
@@ -249,57 +247,59 @@ class ErrorReport:
         return self.module == "DATA_TIMEOUT"
 
 
-@dataclass(frozen=True, slots=True)
-class PingReceived(ModemEvent):
-    """`CAMPA,src,dest`: a ping from `src` to `dest`, whose modem replies automatically."""
-
-    src: int
-    dest: int
-
-    @classmethod
-    def parse(cls, sentence: Sentence) -> PingReceived:
-        """Read `CAMPA`."""
-        read = FieldReader(sentence, ("CAMPA",), 2)
-        return cls(read.address(0, "src"), read.address(1, "dest"))
+def range_measured(sentence: Sentence) -> RangeMeasured:
+    """Read `CAMPR,src,dest,travel_s`: the reply of `src` to a ping; the one-way travel time may be absent."""
+    read = FieldReader(sentence, ("CAMPR",), 2)
+    travel_s = read.optional_real(2, "travel time")
+    if travel_s is not None and not 0.0 <= travel_s <= _MAX_TRAVEL_S:
+        raise SentenceError(sentence.kind, "travel time", travel_s, f"0..{_MAX_TRAVEL_S:g} seconds")
+    return RangeMeasured(read.address(0, "src"), read.address(1, "dest"), travel_s)
 
 
-@dataclass(frozen=True, slots=True)
-class PingAnswered(RangeMeasured):
-    """`CAMPR,src,dest,travel_s`: the reply of `src` to a ping, with the one-way travel time (None where absent)."""
-
-    @classmethod
-    def parse(cls, sentence: Sentence) -> PingAnswered:
-        """Read `CAMPR`."""
-        read = FieldReader(sentence, ("CAMPR",), 2)
-        travel_s = read.optional_real(2, "travel time")
-        if travel_s is not None and not 0.0 <= travel_s <= _MAX_TRAVEL_S:
-            raise SentenceError(sentence.kind, "travel time", travel_s, f"0..{_MAX_TRAVEL_S:g} seconds")
-        return cls(read.address(0, "src"), read.address(1, "dest"), travel_s)
+def short_message(sentence: Sentence) -> ShortMessageReceived:
+    """Read `CAMUA,src,dest,HHHH`: a user mini-packet of 13 bits."""
+    read = FieldReader(sentence, ("CAMUA",), 3)
+    text = read.text(2).strip()
+    if not _MINI_BITS.fullmatch(text) or int(text, 16) > MAX_MINI_BITS:
+        raise SentenceError(sentence.kind, "bits", text, f"hex, at most {MAX_MINI_BITS:X}")
+    return ShortMessageReceived(read.address(0, "src"), read.address(1, "dest"), int(text, 16))
 
 
 @dataclass(frozen=True, slots=True)
-class MiniPacketReceived(ShortMessageReceived):
-    """`CAMUA,src,dest,HHHH`: a user mini-packet; `bits` is 0..0x1FFF."""
+class LinkStatistics(ReceptionQuality):
+    """`CACST`: the measurements of a reception that the driver uses. None where this modem does not report a value.
+
+    The layout is that of version 6 and later; older firmware has the same order, without the version.
+
+    Attributes:
+        mode: 0 good, 1 bad CRC, 2 time-out.
+        packet_type: 1 FSK, 2 FSK mini, 3 PSK, 4 PSK mini, 5 flexible data.
+    """
+
+    mode: int = 0
+    rate: int | None = None
+    src: int | None = None
+    dest: int | None = None
+    packet_type: int | None = None
 
     @classmethod
-    def parse(cls, sentence: Sentence) -> MiniPacketReceived:
-        """Read `CAMUA`."""
-        read = FieldReader(sentence, ("CAMUA",), 3)
-        text = read.text(2).strip()
-        if not _MINI_BITS.fullmatch(text) or int(text, 16) > MAX_MINI_BITS:
-            raise SentenceError(sentence.kind, "bits", text, f"hex, at most {MAX_MINI_BITS:X}")
-        return cls(read.address(0, "src"), read.address(1, "dest"), int(text, 16))
+    def parse(cls, sentence: Sentence) -> LinkStatistics:
+        """Read `CACST`."""
+        first = FieldReader(sentence, ("CACST",), 2).integer(0, "version", 0, 99)
+        fields = sentence.fields[1:] if first >= _FIRST_VERSIONED else sentence.fields
+        read = FieldReader(Sentence(sentence.kind, fields))
+        return cls(
+            mode=read.integer(0, "mode", 0, 255),
+            **{name: read.optional_integer(index, name) for name, index in _INTEGER_STATISTICS.items()},
+            **{name: read.optional_real(index, name) for name, index in _REAL_STATISTICS.items()},  # type: ignore[arg-type]
+        )
+
+    @property
+    def good(self) -> bool:
+        """Whether the packet was received without an error."""
+        return self.mode == 0
 
 
-@dataclass(frozen=True, slots=True)
-class MiniPacketAnswered(ModemEvent):
-    """`CAMUR,src,dest`: `src` has received the mini-packet."""
-
-    src: int
-    dest: int
-
-    @classmethod
-    def parse(cls, sentence: Sentence) -> MiniPacketAnswered:
-        """Read `CAMUR`."""
-        read = FieldReader(sentence, ("CAMUR",), 2)
-        return cls(read.address(0, "src"), read.address(1, "dest"))
+def transmitted_type(sentence: Sentence) -> int | None:
+    """Return the packet type in `CAXST`, the statistics of a transmission; None where the modem does not report it."""
+    return FieldReader(sentence, ("CAXST",), 3).optional_integer(14, "packet_type")

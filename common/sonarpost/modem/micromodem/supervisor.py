@@ -26,9 +26,8 @@ from sonarpost.modem.interface import (
     TransmissionRecovered,
 )
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import FailureReason, UnhandledSentence
 from sonarpost.modem.micromodem.nmea import Sentence
-from sonarpost.modem.micromodem.requests import RequestKind
+from sonarpost.modem.micromodem.requests import FailureReason, RequestKind
 from sonarpost.modem.micromodem.sentences import ConfigurationSetting, ErrorReport, Revision
 
 _OPTIONAL_TRIES = 2
@@ -150,7 +149,7 @@ class ModemSupervisor:
         self._configure(now + self._config.init_pause_s)
         return [ModemRebooted(revision.version)]
 
-    def on_setting(self, sentence: Sentence, now: float) -> list[ModemEvent]:
+    def on_setting(self, sentence: Sentence, now: float) -> None:
         """Process `CACFG`: the answer to a command, a line of a dump, or a change by another program.
 
         Raises:
@@ -158,15 +157,11 @@ class ModemSupervisor:
         """
         setting = ConfigurationSetting.parse(sentence)
         if self._is_answered(sentence, now):
-            return []
+            return
         self._note_dump(now)
-        if self.phase is Phase.CONFIGURING:
-            return []
-        if setting.name == "SRC" and setting.number != self._config.address:
+        if self.phase is not Phase.CONFIGURING and setting.name == "SRC" and setting.number != self._config.address:
             # Another program has set it, or the sentence of a restart was lost.
             self._configure(now)
-            return []
-        return [UnhandledSentence(sentence)]
 
     def on_error(self, report: ErrorReport, now: float) -> None:
         """Process an error of the modem: it may have rejected an optional command, which is sent again soon."""

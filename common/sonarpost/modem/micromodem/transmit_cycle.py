@@ -7,9 +7,9 @@ from enum import Enum, auto
 
 from sonarpost.modem.interface import PacketFailed, PacketSent
 from sonarpost.modem.micromodem.config import MicroModemConfig
-from sonarpost.modem.micromodem.events import FailureReason, MicroModemPacketSent
 from sonarpost.modem.micromodem.nmea import Sentence
 from sonarpost.modem.micromodem.reception import FSK_MINI_PACKET
+from sonarpost.modem.micromodem.requests import FailureReason
 from sonarpost.modem.micromodem.sentences import (
     Acknowledgement,
     ConfigurationSetting,
@@ -19,7 +19,6 @@ from sonarpost.modem.micromodem.sentences import (
     TransmitMark,
     transmit_data,
 )
-from sonarpost.modem.micromodem.statistics import TransmitStatistics
 from sonarpost.modem.packet_queue import WaitingPacket
 
 
@@ -75,7 +74,6 @@ class TransmitCycle:
         self._on_air = False
         self._end_reported = False
         self._error_reported = False  # after the data, before the transmission
-        self._statistics: TransmitStatistics | None = None
         if polled is None:
             self.poll(now)
         else:
@@ -137,14 +135,12 @@ class TransmitCycle:
             else:
                 self._wait(TransmitStage.ON_AIR, now, self._config.on_air_limit_s(self.packet.rate))
 
-    def on_statistics(self, statistics: TransmitStatistics | None, now: float) -> None:
-        """Process `CAXST`, None for an invalid one; those of a rate 0 header are ignored."""
-        header = statistics is not None and statistics.packet_type == FSK_MINI_PACKET
-        if header or not self._frames_given:
+    def on_statistics(self, packet_type: int | None, now: float) -> None:
+        """Process `CAXST` with its packet type; those of a rate 0 header are ignored."""
+        if packet_type == FSK_MINI_PACKET or not self._frames_given:
             return
         if self.stage in _AFTER_ECHO - {TransmitStage.REQUEST} or self.stage is TransmitStage.STATISTICS:
             self._on_air = self._end_reported = True
-            self._statistics = statistics
             self._transmitted(now)
 
     def on_acknowledgement(self, acknowledgement: Acknowledgement, now: float) -> None:
@@ -229,19 +225,8 @@ class TransmitCycle:
             self._finish(now)
 
     def _finish(self, now: float) -> None:
-        p = self.packet
-        acknowledged = tuple(sorted(self._acknowledged))
-        self.result = MicroModemPacketSent(
-            p.number,
-            p.destination,
-            p.rate,
-            p.frames,
-            acknowledged,
-            self._started_s,
-            now,
-            self._end_reported,
-            self._statistics,
-        )
+        acknowledged = sorted(self._acknowledged)
+        self.result = self.packet.sent(acknowledged, self._started_s, now, end_reported=self._end_reported)
         self.stage = TransmitStage.OVER
 
     def _wait(self, stage: TransmitStage, now: float, wait_s: float) -> None:
