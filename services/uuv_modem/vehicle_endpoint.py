@@ -252,8 +252,7 @@ class VehicleEndpoint:
         if self.authenticator is not None:
             self._effects.count("frames_forged")
             return
-        block, missing = unpack_mini(bits)
-        self.queue.on_mini_feedback(block, missing, now, source)
+        self.queue.on_feedback(unpack_mini(bits), now, source)
         self._effects.count("feedback_received")
 
     def _receive_feedback(self, event: FeedbackReceived, now: float) -> None:

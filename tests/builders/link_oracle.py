@@ -62,7 +62,6 @@ def check_receiver(data: bytes) -> int:
             if receiver.feedback_is_due(source, now):
                 feedback = receiver.feedback(source, now)
                 assert feedback is None or len(feedback.pack()) <= 19
-            receiver.mini_feedback(source)
     v1_fuzz.check_bounds(receiver)
     restored = V1Receiver(v1_fuzz.SMALL)
     assert not restored.restore(receiver.parts())

@@ -210,10 +210,6 @@ class ImageSender(ABC):
             FrameError: A request for an image that is not kept.
         """
 
-    def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int) -> None:
-        """Process the feedback of a mini-packet, on one block."""
-        self.on_feedback(Feedback(block_number, 0, (missing_symbols,)), now, receiver)
-
     @property
     def accepts_messages(self) -> bool:
         """Whether the queue has room for another message."""

@@ -36,16 +36,16 @@ class LossMeter:
     loss: Annotated[float, Bounds(0, 1)] | None = None
     last_counts: tuple[SavedCount, SavedCount] | None = None
 
-    def update(self, feedback: Feedback, frames_sent: int) -> None:
+    def update(self, frames_received: int, frames_sent: int) -> None:
         """Add a feedback with a weight of a quarter. Intervals of fewer than 16 frames are joined."""
         if self.last_counts is not None:
             sent = frames_sent - self.last_counts[0]
             if sent < _MIN_FRAMES_TO_MEASURE:
                 return
-            received = (feedback.frames - self.last_counts[1]) % 65536
+            received = (frames_received - self.last_counts[1]) % 65536
             loss = min(max(1.0 - received / sent, 0.0), 1.0)
             self.loss = loss if self.loss is None else 0.75 * self.loss + 0.25 * loss
-        self.last_counts = (frames_sent, feedback.frames)
+        self.last_counts = (frames_sent, frames_received)
 
 
 @dataclass(eq=False)
@@ -68,7 +68,8 @@ class FeedbackTracker:
 
     def measure(self, feedback: Feedback, receiver: int, frames_sent: int) -> None:
         """Update the loss to a receiver."""
-        self.meters.setdefault(receiver, LossMeter()).update(feedback, frames_sent)
+        if feedback.frames is not None:
+            self.meters.setdefault(receiver, LossMeter()).update(feedback.frames, frames_sent)
 
     def apply(
         self, feedback: Feedback, blocks: Sequence[SendBlock], config: SenderConfig, now: float, receiver: int

@@ -279,7 +279,7 @@ class VesselEndpoint:
 
     def _add_feedback(self, address: int, now: float, packer: _FramePacker) -> bool:
         """Add the feedback for a vehicle, if there is some and it fits."""
-        if not self._feedback or not (self._feedback_is_due(address, now) or self.v1.mini_feedback(address)):
+        if not self._feedback or not (self._feedback_is_due(address, now) or self.v1.is_incomplete(address)):
             return False
         longest = Segment(SegmentKind.FEEDBACK, Feedback(0, 0, (0,) * 16).pack())
         if not packer.fits(longest):

@@ -232,24 +232,16 @@ class TransmitQueue(ImageSender):
             FrameError: A request for an image that is not kept.
         """
         if isinstance(feedback, Feedback):
-            self._feedback_arrived(now)
+            self.last_feedback_s = now
+            self._frames_at_feedback = self.sender.state.frames_sent
+            if self.config.feedback == "auto":
+                self.sender.expect_feedback(expected=True)
         self.sender.on_feedback(feedback, now, receiver)
         loss = self.measured_loss
-        if isinstance(feedback, Feedback) and loss is not None:
+        if isinstance(feedback, Feedback) and feedback.frames is not None and loss is not None:
             self.rate_selector.record_loss(loss, now)
             if abs(self.planned_loss - loss) >= _MIN_LOSS_CHANGE:
                 self.sender.plan_for((LossChannel(min(loss, _MAX_LOSS), self.config.burst_frames),))
-
-    @override
-    def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int) -> None:
-        self._feedback_arrived(now)
-        self.sender.on_mini_feedback(block_number, missing_symbols, now, receiver)
-
-    def _feedback_arrived(self, now: float) -> None:
-        self.last_feedback_s = now
-        self._frames_at_feedback = self.sender.state.frames_sent
-        if self.config.feedback == "auto":
-            self.sender.expect_feedback(expected=True)
 
     @override
     def _select_packet(self, now: float) -> OutgoingPacket | None:

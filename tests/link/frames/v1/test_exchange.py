@@ -21,7 +21,7 @@ from sonarpost.link.frames.v1.frame import (
     pack_symbol,
     parse_frame,
 )
-from sonarpost.link.frames.v1.payload_objects import RefineRequest
+from sonarpost.link.frames.v1.payload_objects import RefineRequest, unpack_mini
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import SenderState, V1Sender, WaitingImages
 from sonarpost.link.receiver import FrameRejected, ImageUpdate
@@ -179,14 +179,13 @@ def test_mini_packet_requests_symbols() -> None:
         frames.append(frame)
     for frame in frames[:-2]:
         receiver.accept(VEHICLE, frame, 1.0)
-    bits = receiver.mini_feedback(VEHICLE)
-    assert bits is not None
-    assert (bits >> 8, bits & 255) == (1, 2)
-    sender.on_mini_feedback(bits >> 8, bits & 255, 2.0)
+    assert receiver.is_incomplete(VEHICLE)
+    sender.on_feedback(unpack_mini(1 << 8 | 2), 2.0)
+    assert sender.state.tracker.loss is None
     events = [e for _ in range(2) if (f := sender.next_frame(2.0)) for e in receiver.accept(VEHICLE, f, 2.0)]
     assert isinstance(events[-1], ImageUpdate)
     assert events[-1].complete
-    assert receiver.mini_feedback(VEHICLE) is None
+    assert not receiver.is_incomplete(VEHICLE)
 
 
 def test_another_frame_length_restarts_only_blocks_that_do_not_fit() -> None:

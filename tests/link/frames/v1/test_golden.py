@@ -19,7 +19,14 @@ from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.paper.frame import ContactFrame
 from sonarpost.link.frames.paper.frame import parse_frame as parse_paper_frame
 from sonarpost.link.frames.v1.frame import Content, Segment, Symbol, SymbolKind, pack_segments, pack_symbol, parse_frame
-from sonarpost.link.frames.v1.payload_objects import MessageObject, PieceList, Preview, pack_mini, unpack_object
+from sonarpost.link.frames.v1.payload_objects import (
+    Feedback,
+    MessageObject,
+    PieceList,
+    Preview,
+    unpack_mini,
+    unpack_object,
+)
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived
 
@@ -86,7 +93,8 @@ def test_golden_objects() -> None:
     message, packed = MessageObject(entry["number"], bytes.fromhex(entry["data"])), bytes.fromhex(entry["object"])
     assert unpack_object(packed) == message
     assert message.pack(len(packed)) == packed
-    assert [pack_mini(block, needed) for block, needed, _ in read["minipackets"]] == [m[2] for m in read["minipackets"]]
+    for block, needed, bits in read["minipackets"]:
+        assert unpack_mini(bits) == Feedback(block, None, (needed,))
 
 
 def test_golden_classified_records() -> None:

@@ -363,18 +363,19 @@ class Feedback:
 
     Attributes:
         newest: Number of the newest block received, 0..31.
-        frames: Frames received from this sender since the first start, modulo 65536, to measure the loss.
+        frames: Frames received from this sender since the first start, modulo 65536, to measure the loss; None in a
+            mini-packet.
         missing: Missing symbols of the block `newest`, the one before it, and so on, at most 16: 0 complete, 1..254
             (254: or more), 255 no symbol has arrived.
     """
 
     newest: int
-    frames: int
+    frames: int | None
     missing: tuple[int, ...]
 
     def pack(self) -> bytes:
         """Return the data of a FEEDBACK segment, 3 to 19 bytes."""
-        return bytes([self.newest, self.frames >> 8 & 255, self.frames & 255, *self.missing])
+        return bytes([self.newest]) + (self.frames or 0).to_bytes(2, "big") + bytes(self.missing)
 
     @classmethod
     def unpack(cls, data: bytes, where: str = "feedback") -> Feedback:
@@ -422,24 +423,12 @@ class RefineRequest:
         return request
 
 
-def pack_mini(block: int, missing_symbols: int) -> int:
-    """Return 13 bits for a mini-packet: feedback on one block.
-
-    Raises:
-        FrameError: A number out of range.
-    """
-    if not 0 <= block < BLOCKS or not 0 <= missing_symbols <= NEVER_RECEIVED:
-        expected = f"below {BLOCKS}, 0..{NEVER_RECEIVED}"
-        raise FrameError("mini-packet", "block, missing symbols", (block, missing_symbols), expected)
-    return block << 8 | missing_symbols
-
-
-def unpack_mini(bits: int) -> tuple[int, int]:
-    """Return the block and its missing symbols.
+def unpack_mini(bits: int) -> Feedback:
+    """Return the feedback of a mini-packet of 13 bits: the missing symbols of one block, without a count of frames.
 
     Raises:
         FrameError: More than 13 bits.
     """
     if not 0 <= bits < 1 << 13:
         raise FrameError("mini-packet", "bits", bits, "0..0x1FFF")
-    return bits >> 8, bits & 255
+    return Feedback(bits >> 8, None, (bits & 255,))

@@ -34,7 +34,6 @@ from sonarpost.link.frames.v1.payload_objects import (
     RefineRequest,
     StreamPiece,
     contact_link,
-    pack_mini,
 )
 from sonarpost.link.receiver import Event, FeedbackReceived, FrameRejected, ImageUpdate, MessageReceived
 from sonarpost.link.state import SEPARATE, Bounds, Byte, Errors, PartReader, Parts, SavedCount, pack_part
@@ -556,14 +555,10 @@ class V1Receiver:
         if peer is not None and number in peer.images:
             peer.images[number].stopped = True
 
-    def mini_feedback(self, source: int) -> int | None:
-        """Return 13 bits for a mini-packet: the oldest incomplete block. None if all are complete."""
+    def is_incomplete(self, source: int) -> bool:
+        """Whether symbols of a sender's blocks are missing."""
         peer = self._sources.get(source)
-        if peer is None or not peer.is_incomplete:
-            return None
-        missing = peer.missing_symbols
-        back = max(i for i, number in enumerate(missing) if number)
-        return pack_mini((peer.newest_block - back) % BLOCKS, missing[back])
+        return peer is not None and peer.is_incomplete
 
     def parts(self) -> dict[str, bytes]:
         """Return the state to save, see `sonarpost.link.state`: counters, senders, their images and blocks."""

@@ -393,13 +393,6 @@ class V1Sender:
             self.refine(feedback, now)
             return
         self.state.tracker.measure(feedback, receiver, self.state.frames_sent)
-        self._apply(feedback, now, receiver)
-
-    def on_mini_feedback(self, block_number: int, missing_symbols: int, now: float, receiver: int = 0) -> None:
-        """Process the feedback of a mini-packet, on one block."""
-        self._apply(Feedback(block_number, 0, (missing_symbols,)), now, receiver)
-
-    def _apply(self, feedback: Feedback, now: float, receiver: int) -> None:
         window = self.window
         if self.config.feedback:
             window.resume_retired(feedback)
