@@ -45,8 +45,6 @@ EXPECTED = {
     "sonarpost/v1/shore-2/contact/vessel-1/image": keys.shore_image("vessel-1", "shore-2"),
     "sonarpost/v1/shore-2/contact/vessel-1/decision": keys.shore_decision("vessel-1", "shore-2"),
     "sonarpost/v1/shore/contact/*/*": keys.shore_contact_all(),
-    "sonarpost/v1/shore/contact/*/image": keys.shore_image_all(),
-    "sonarpost/v1/shore/contact/*/decision": keys.shore_decision_all(),
     "sonarpost/v1/*/acoustic/queue": keys.acoustic_queue_everywhere(),
     "sonarpost/v1/shore/tasking/vessel-1/comment": keys.tasking_comment("vessel-1"),
     "sonarpost/v1/shore/tasking/*/comment": keys.tasking_comment_all(),

@@ -29,6 +29,15 @@ def _of(platform: str, rest: str) -> str:
     return f"{ROOT}/{_name('platform', platform)}/{rest}"
 
 
+def _vessel_in(key: str, form: str) -> str:
+    """Return the vessel in a key of the form `sonarpost/v1/{site}/word/{vessel}/word`; `…` stands for any word."""
+    parts, words = key.split("/"), form.split("/")
+    fits = len(parts) == len(words) and all(parts[i] == words[i] or words[i] == "…" for i in (0, 1, 3, 5))
+    if not fits:
+        raise BadInputError(key, "", key, form)
+    return _name("vessel", parts[4])
+
+
 def contact_detected(vehicle: str) -> str:
     """A contact and its snippet (the paper's imgToCompress).
 
@@ -75,10 +84,7 @@ def frames_vessel(key: str) -> str:
     Raises:
         BadInputError: It is another key.
     """
-    parts = key.split("/")
-    if len(parts) != 6 or not key.startswith(f"{ROOT}/") or parts[3] != "inbox" or parts[5] != "frame":
-        raise BadInputError(key, "", key, f"{ROOT}/{{lead}}/inbox/{{vessel}}/frame")
-    return _name("vessel", parts[4])
+    return _vessel_in(key, f"{ROOT}/{{lead}}/inbox/{{vessel}}/frame")
 
 
 def acoustic_image(vessel: str) -> str:
@@ -268,10 +274,7 @@ def part_vessel(key: str) -> str:
     Raises:
         BadInputError: It is another key.
     """
-    parts = key.split("/")
-    if len(parts) != 6 or not key.startswith(f"{ROOT}/") or parts[3] != "inbox" or parts[5] != "part":
-        raise BadInputError(key, "", key, f"{ROOT}/{{site}}/inbox/{{vessel}}/part")
-    return _name("vessel", parts[4])
+    return _vessel_in(key, f"{ROOT}/{{site}}/inbox/{{vessel}}/part")
 
 
 def shore_inbox_all(site: str = SHORE) -> str:
@@ -319,16 +322,6 @@ def shore_status_all(site: str = SHORE) -> str:
 def shore_status_everywhere() -> str:
     """Statuses of the vehicles of every vessel at every site."""
     return f"{ROOT}/*/status/*"
-
-
-def shore_image_all(site: str = SHORE) -> str:
-    """Images of every vessel that a site's c2 has stored."""
-    return _of(site, "contact/*/image")
-
-
-def shore_decision_all(site: str = SHORE) -> str:
-    """Decisions of every vessel that a site's c2 has stored."""
-    return _of(site, "contact/*/decision")
 
 
 def shore_contact_all(site: str = SHORE) -> str:
@@ -385,10 +378,7 @@ def tasking_vessel(key: str) -> str:
     Raises:
         BadInputError: It is another key.
     """
-    parts = key.split("/")
-    if len(parts) != 6 or not key.startswith(f"{ROOT}/") or parts[3] != "tasking":
-        raise BadInputError(key, "", key, f"{ROOT}/{{site}}/tasking/{{vessel}}/…")
-    return _name("vessel", parts[4])
+    return _vessel_in(key, f"{ROOT}/{{site}}/tasking/{{vessel}}/…")
 
 
 def tasking_state(vessel: str, site: str = SHORE) -> str:

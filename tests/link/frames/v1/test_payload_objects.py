@@ -200,11 +200,11 @@ def test_refine_request_round_trip() -> None:
 
 def test_loss_is_measured_between_feedback_messages() -> None:
     meter = LossMeter()
-    meter.update(Feedback(0, 65500, ()), 100)
+    meter.update(65500, 100)
     assert meter.loss is None
-    meter.update(Feedback(0, 65501, ()), 110)  # an interval that is too short
+    meter.update(65501, 110)  # an interval that is too short
     assert meter.loss is None
-    meter.update(Feedback(0, (65500 + 70) % 65536, ()), 200)
+    meter.update((65500 + 70) % 65536, 200)
     assert meter.loss == pytest.approx(0.3)
-    meter.update(Feedback(0, (65500 + 70) % 65536, ()), 300)
+    meter.update((65500 + 70) % 65536, 300)
     assert meter.loss == pytest.approx(0.75 * 0.3 + 0.25)
