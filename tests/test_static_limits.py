@@ -22,7 +22,7 @@ SOCKETS = {
 THREADS = {
     "common/sonarpost/bus/router.py": "health of the router",
     "common/sonarpost/cli/c2/tasking.py": "timer that sets an event",
-    "common/sonarpost/cli/deployment/run_all.py": "copies the output of a process",
+    "common/sonarpost/cli/run.py": "copies the output of a process",
     "common/sonarpost/cli/progress.py": "prints progress",
     "common/sonarpost/delivery/inbox.py": "guarded: accepts records",
     "common/sonarpost/delivery/outbox.py": "guarded: starts senders",

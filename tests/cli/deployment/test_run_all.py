@@ -12,9 +12,9 @@ from types import SimpleNamespace
 import pytest
 from builders.common import eventually, free_port
 
-from sonarpost.cli.deployment import run_all
-from sonarpost.cli.deployment.run_all import Supervisor, router_module
+from sonarpost.cli import run as run_command
 from sonarpost.cli.main import main
+from sonarpost.cli.run import Supervisor, router_module
 from sonarpost.config import PlatformConfig
 from sonarpost.errors import ConfigError
 
@@ -157,8 +157,8 @@ class Bench:
 
     def __init__(self, monkeypatch, *lives_s, ended_with=1):
         self.now_s, self.lives_s, self.started_s, self.ended_with = 0.0, lives_s, [], ended_with
-        monkeypatch.setattr(run_all, "Processes", lambda: self)
-        monkeypatch.setattr(run_all, "time", self)
+        monkeypatch.setattr(run_command, "Processes", lambda: self)
+        monkeypatch.setattr(run_command, "time", self)
 
     def spawn(self, *_):
         self.started_s.append(self.now_s)
@@ -177,7 +177,7 @@ class Bench:
 
 
 def test_the_wait_before_a_restart_doubles_until_a_process_was_stable(monkeypatch, capsys):
-    lives_s = (0.0,) * 7 + (run_all.STABLE_S, 0.0, 0.0)
+    lives_s = (0.0,) * 7 + (run_command.STABLE_S, 0.0, 0.0)
     bench = Bench(monkeypatch, *lives_s)
     supervisor = Supervisor(bench, width=4)
     supervisor.start("ends", ["module"])

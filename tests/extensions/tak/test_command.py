@@ -13,7 +13,7 @@ from builders.tls_authority import Authority
 from extensions.tak.tak_server import TakServer
 
 from sonarpost import keys, wire
-from sonarpost.cli.c2.live import ContactChange
+from sonarpost.cli.c2.watch import ContactChange
 from sonarpost.cli.main import main
 from sonarpost.export.live import LiveContacts
 from sonarpost.extensions.tak import command

@@ -18,7 +18,7 @@ from builders.exports import Clock, contact_of, image
 from builders.shore import Site
 from builders.unreached_router import check_unreached_router
 
-from sonarpost.cli.c2.live import ContactChange
+from sonarpost.cli.c2.watch import ContactChange
 from sonarpost.cli.main import main
 from sonarpost.errors import PortError
 from sonarpost.extensions.tak import command

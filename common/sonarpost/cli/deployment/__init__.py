@@ -1,1 +1,1 @@
-"""Commands that put the services on a host: configuration files, systemd units, and all services in one terminal."""
+"""Commands that put the services on a host: configuration files, systemd units, child processes."""

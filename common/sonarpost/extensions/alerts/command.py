@@ -12,7 +12,7 @@ from typing import Final
 
 from sonarpost import logs
 from sonarpost.bus.session import open_with_retry
-from sonarpost.cli.c2.live import ContactStream, add_live_options
+from sonarpost.cli.c2.watch import ContactStream, add_live_options
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.shared import in_new_folder, log_level, option, router_of
 from sonarpost.errors import ConfigError, PortError

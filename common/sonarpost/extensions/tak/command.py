@@ -12,7 +12,7 @@ from typing import Final
 
 from sonarpost import keys, logs, wire
 from sonarpost.bus.session import open_with_retry
-from sonarpost.cli.c2.live import ContactChange, ContactStream, add_live_options
+from sonarpost.cli.c2.watch import ContactChange, ContactStream, add_live_options
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.shared import flag, log_level, option, print_rejected, router_of
 from sonarpost.config import PlatformConfig, load
