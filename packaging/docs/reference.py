@@ -193,7 +193,7 @@ def image_table(_: str = "") -> str:
 
 def metrics(_: str = "") -> str:
     """Return the table of the metrics that do not depend on a service's counters and gauges."""
-    from sonarpost.extensions.metrics.collector import FleetCollector  # noqa: PLC0415 it can be removed
+    from sonarpost.extensions.metrics.command import FleetCollector  # noqa: PLC0415 it can be removed
 
     rows = []
     for family in FleetCollector(lambda: FleetState(services=(), connected=True, rejected=0)).collect():

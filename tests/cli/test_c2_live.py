@@ -8,7 +8,7 @@ from builders.shore import Site
 from sonarpost import keys, wire
 from sonarpost.bus.catch_up import CatchUpSubscriber
 from sonarpost.bus.session import client_config, router_config
-from sonarpost.cli.c2 import live as live_module
+from sonarpost.cli.c2 import watch as live_module
 from sonarpost.cli.c2.watch import ContactStream
 from sonarpost.export.live import LiveContacts
 from sonarpost.review.rendering import encode_png

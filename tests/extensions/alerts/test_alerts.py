@@ -26,9 +26,8 @@ from sonarpost.cli.main import main
 from sonarpost.errors import DeliveryError, PortError
 from sonarpost.export.live import LiveContacts
 from sonarpost.extensions.alerts import command
-from sonarpost.extensions.alerts.command import AlertService, SentAlerts
-from sonarpost.extensions.alerts.document import alert_document, needs_alert, score, signature
-from sonarpost.extensions.alerts.senders import AlertNotAcceptedError, AlertRefusedError, AlertWebhook, Mqtt
+from sonarpost.extensions.alerts.command import AlertService, SentAlerts, alert_document, needs_alert, score
+from sonarpost.extensions.alerts.senders import AlertNotAcceptedError, AlertRefusedError, AlertWebhook, Mqtt, signature
 from sonarpost.security.client_tls import TlsFiles
 from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
 

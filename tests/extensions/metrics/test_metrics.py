@@ -13,7 +13,7 @@ from prometheus_client.openmetrics.exposition import generate_latest as openmetr
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
 from prometheus_client.parser import text_string_to_metric_families
 
-from sonarpost.extensions.metrics.collector import MAX_VALUES, FleetCollector, registry_of
+from sonarpost.extensions.metrics.command import MAX_VALUES, FleetCollector, registry_of
 from sonarpost.messages import Health
 from sonarpost.monitoring.fleet import FleetState, ServiceStatus
 from sonarpost.services.c2.config import C2Config

@@ -1,6 +1,7 @@
 """`sonarpost c2 alert`: sends an alert for each contact above a threshold to a webhook or an MQTT broker."""
 
 import argparse
+import json
 import logging
 import math
 import time
@@ -17,8 +18,8 @@ from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.shared import in_new_folder, log_level, option, router_of
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.export.contacts import ExportContact
-from sonarpost.export.text import utc_text
-from sonarpost.extensions.alerts.document import alert_document, needs_alert
+from sonarpost.export.tables import contact_properties
+from sonarpost.export.text import utc_text, xml_text
 from sonarpost.extensions.alerts.senders import (
     AlertNotAcceptedError,
     AlertRefusedError,
@@ -34,6 +35,10 @@ from sonarpost.stop_signals import stop_on_signals
 
 log = logging.getLogger(__name__)
 
+TYPE: Final = "sonarpost.alert"
+VERSION: Final = 1
+MAX_CONFIDENCE: Final = 2.0
+"""Highest confidence of the detector."""
 RETRY_S: Final = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0)
 MAX_NOT_ACCEPTED_RETRY_S: Final = limit(
     5.0, "s", "blame", "alerts", "vessel", "delay by alerts that the receiver refuses", "other vessels follow"
@@ -223,3 +228,49 @@ class AlertService:
 
 def _pause_s(failures: int) -> float:
     return RETRY_S[min(failures, len(RETRY_S) - 1)]
+
+
+def score(contact: ExportContact) -> float | None:
+    """Return how much a contact resembles a mine, 0 to 1; None if it is not known.
+
+    It is the probability of a mine-like object. A contact without probabilities has half the confidence of the
+    detector, which is 0 to 2 and not a probability.
+    """
+    record = contact.image.contact
+    if record is None:
+        return None
+    if record.p_mine_like is not None:
+        return record.p_mine_like
+    return None if record.atd_confidence is None else record.atd_confidence / MAX_CONFIDENCE
+
+
+def needs_alert(contact: ExportContact, threshold: float) -> bool:
+    """Return whether a contact causes an alert.
+
+    An operator's verdict counts more than the detector: a mine-like or disputed contact causes one, a contact that is
+    not mine-like causes none.
+
+    Args:
+        contact: The contact.
+        threshold: Smallest score of a contact without a verdict, 0 to 1.
+    """
+    if contact.review in ("mine_like", "disputed"):
+        return True
+    value = score(contact)
+    return contact.review != "not_mine_like" and value is not None and value >= threshold
+
+
+def alert_document(contact: ExportContact, sent_utc: str) -> bytes:
+    """Return the alert as JSON: `type`, `v`, `id`, `sent_utc`, `score`, and the known properties of the contact.
+
+    Args:
+        contact: The contact.
+        sent_utc: Time of the first attempt to send it, ISO 8601.
+    """
+    known = {
+        name: xml_text(value) if isinstance(value, str) else value
+        for name, value in contact_properties(contact).items()
+        if value is not None and name != "image_file"
+    }
+    head = {"type": TYPE, "v": VERSION, "id": contact.uid, "sent_utc": sent_utc, "score": score(contact)}
+    return json.dumps({**head, "contact": known}, ensure_ascii=False, allow_nan=False).encode()

@@ -1,5 +1,7 @@
 """Ways of an alert: an HTTP webhook, an MQTT broker."""
 
+import hashlib
+import hmac
 import ssl
 import threading
 import time
@@ -10,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from sonarpost.errors import ConfigError, PortError
-from sonarpost.extensions.alerts.document import signature
 from sonarpost.network import http_client
 from sonarpost.security.client_tls import TlsFiles
 
@@ -192,3 +193,8 @@ def _split(option: str, url: str, schemes: tuple[str, str]) -> SplitResult:
     if not is_valid or parts.password or not url.isprintable() or " " in url:
         raise ConfigError("c2 alert", option, url, expected)
     return parts
+
+
+def signature(key: bytes, timestamp: str, body: bytes) -> str:
+    """Return the value of the header `X-Sonarpost-Signature`: HMAC-SHA256 of timestamp, a dot and the body."""
+    return "sha256=" + hmac.new(key, timestamp.encode() + b"." + body, hashlib.sha256).hexdigest()
