@@ -111,7 +111,6 @@ class Archive:
                 folder = self.shore.folder
                 if folder is not None:
                     remove_temporary_files(folder)
-                    self.shore.complete_files()
                     if self.shore.database.is_new:
                         self._restore(folder)
                 self._is_open = True
@@ -174,8 +173,8 @@ class Archive:
         if found_other is None and same_version(stored := self._side_car(image.vessel_id, name), image):
             if PREVIEW_NOTE in image.notes:
                 return name, True, False
-            if PREVIEW_NOTE in stored.get("notes", ()):
-                # The whole replaces its preview.
+            if PREVIEW_NOTE in stored.get("notes", ()) or stored == json.loads(text):
+                # The whole replaces its preview; its files are there already after a crash before the commit.
                 self._batch.images = [
                     i for i in self._batch.images if (i.row.vessel_id, i.row.name) != (image.vessel_id, name)
                 ]

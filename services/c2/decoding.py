@@ -11,15 +11,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Final
 
-from sonarpost import wire
-from sonarpost.archive import image_parts
 from sonarpost.archive.backlog import Backlog, BacklogRecord
 from sonarpost.archive.decode_worker import Decoded, DecodeWorker
 from sonarpost.delivery.store import Store
-from sonarpost.errors import BadInputError, DeliveryError, can_concern_record
+from sonarpost.errors import DeliveryError, can_concern_record
 from sonarpost.limits import Turns, limit
 from sonarpost.logs import kv
-from sonarpost.messages import CodedImage, ImagePart, ReconstructedImage
+from sonarpost.messages import ReconstructedImage
 from sonarpost.runtime.service import ServiceStoppingError
 
 log = logging.getLogger(__name__)
@@ -46,16 +44,6 @@ MAX_WAITING: Final = limit(
 MAX_MODELS: Final = limit(
     8, "codebooks", "shares", "codebooks of vessels", "vessel", "codebooks to wait for", "others wait"
 )
-
-
-def coded_image(entry: BacklogRecord) -> CodedImage:
-    """Return the coded image of an entry of the backlog.
-
-    Raises:
-        PayloadError: It is invalid.
-    """
-    where = f"image of {entry.vessel_id}"
-    return image_parts.coded_image(wire.decode(ImagePart, entry.payload, where), entry.vessel_id, where)
 
 
 @dataclass
@@ -292,9 +280,7 @@ class Decoding:
         started_s = time.monotonic()
         worker = self._idle.pop()
         try:
-            result = worker.decode(coded_image(entry))
-        except BadInputError as error:
-            result = Decoded(reason=str(error))
+            result = worker.decode(entry.vessel_id, entry.payload)
         except Exception as error:
             log.exception("Image not decoded after an unexpected exception")
             result = Decoded(reason=f"{type(error).__name__}: {error}", failure="crash")

@@ -144,8 +144,8 @@ def test_another_content_under_a_name_is_not_written(archive):
 def test_row_number_and_end_of_the_acceptance_are_one_transaction(archive):
     part = BacklogRecord("some/key", b"part", "vessel-1")
     archive.write(Batch(waiting=[part], numbered=[columns("0001")]))
-    broken = StoredImage(stored("0002").row, ((".json", None),))
-    with pytest.raises(Exception, match="content"):
+    broken = StoredImage(replace(stored("0002").row, codec=None), stored("0002").files)
+    with pytest.raises(Exception, match="codec"):
         archive.write(Batch(images=[broken], finished=[part], numbered=[columns("0002")]))
     assert (archive.images(), archive.backlog.count(), archive.journal.position()[1]) == ([], 1, 1)
     archive.write(Batch(images=[stored("0002")], finished=[part], numbered=[columns("0002")]))
@@ -208,22 +208,24 @@ def test_older_state_does_not_replace_a_newer_one(archive):
 # Files in a folder
 
 
-def test_files_that_could_not_be_written_are_written_later(tmp_path):
+def files_in(folder):
+    return sorted(path.name for path in folder.glob("vessel-1/*.*"))
+
+
+def test_image_whose_files_cannot_be_written_is_not_stored(tmp_path):
     archive = open_archive(tmp_path / "out")
     archive.write(Batch(images=[stored("0001")]))
     (archive.folder / "vessel-1").rename(tmp_path / "elsewhere")
     (archive.folder / "vessel-1").write_text("not a folder")
+    batch = Batch(images=[stored("0002")], numbered=[columns("0002")])
     with pytest.raises(OSError, match="vessel-1"):
-        archive.write(Batch(images=[stored("0002")], numbered=[columns("0002")]))
-    assert len(archive.images()) == 2, "the row and its number are stored"
-    assert archive.read_files("vessel-1", "name_0002")[".tiff"] == b"tiff"
+        archive.write(batch)
+    assert (len(archive.images()), archive.journal.position()[1]) == (1, 0)
     (archive.folder / "vessel-1").unlink()
     (tmp_path / "elsewhere").rename(archive.folder / "vessel-1")
-    archive.write(Batch(decisions=[decided()]))
-    assert sorted(path.name for path in archive.folder.glob("vessel-1/*.*")) == [
-        f"name_000{number}{suffix}" for number in (1, 2) for suffix in (".json", ".png", ".tiff")
-    ]
-    archive.write(Batch(tasking=[command_row()]))
+    archive.write(batch)
+    assert (len(archive.images()), archive.journal.position()[1]) == (2, 1)
+    assert files_in(archive.folder) == [f"name_000{n}{suffix}" for n in (1, 2) for suffix in (".json", ".png", ".tiff")]
     assert execute(archive, "SELECT count(*) FROM file")[0][0] == 0
     archive.close()
 
@@ -238,30 +240,29 @@ from sonarpost.archive.backlog import BacklogRecord
 from sonarpost.archive.reader import open_archive
 archive = open_archive(Path({folder!r}))
 part = BacklogRecord("some/key", b"part", "vessel-1")
-archive.write(Batch(waiting=[part]))
-if {before}:
+batch = Batch(images=[stored()], decisions=[decided()], finished=[part], numbered=[columns("AAAA")])
+if {first}:
+    archive.write(Batch(waiting=[part]))
     archive.journal.number = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-else:
-    shore_archive.write_files = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-archive.write(Batch(images=[stored()], decisions=[decided()], finished=[part], numbered=[columns("AAAA")]))
+archive.write(batch)
+os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-@pytest.mark.parametrize("before", [True, False])
-def test_kill_before_or_after_the_commit_leaves_nothing_or_everything(tmp_path, before):
+def test_kill_before_or_after_the_commit_leaves_no_row_or_everything(tmp_path):
     folder = tmp_path / "out"
-    script = KILLED.format(tests=str(Path(__file__).parents[1]), folder=str(folder), before=before)
-    assert (
-        subprocess.run([sys.executable, "-c", script], env=dict(os.environ), check=False).returncode == -signal.SIGKILL
-    )
-    archive = open_archive(folder)
-    archive.complete_files()
-    found = (len(archive.images()), len(archive.decisions()), archive.journal.position()[1], archive.backlog.count())
-    assert found == ((0, 0, 0, 1) if before else (1, 1, 1, 0))
-    assert len([path for path in folder.rglob("*.*") if "archive.db" not in path.name]) == (0 if before else 4)
-    if not before:
-        assert [result.fault for result in archive.verify(1e9, 86400.0, 86400.0)] == ["", ""]
-    archive.close()
+    for first in (True, False):
+        script = KILLED.format(tests=str(Path(__file__).parents[1]), folder=str(folder), first=first)
+        status = subprocess.run([sys.executable, "-c", script], env=dict(os.environ), check=False).returncode
+        assert status == -signal.SIGKILL
+        archive = open_archive(folder)
+        last = archive.journal.position()[1]
+        found = (len(archive.images()), len(archive.decisions()), last, archive.backlog.count())
+        assert found == ((0, 0, 0, 1) if first else (1, 1, 1, 0))
+        if not first:
+            assert len(files_in(folder)) == 3
+            assert [result.fault for result in archive.verify(1e9, 86400.0, 86400.0)] == ["", ""]
+        archive.close()
 
 
 def test_no_connection_outlives_the_end(archive):

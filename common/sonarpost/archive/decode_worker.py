@@ -1,8 +1,9 @@
 """Decoding of images in a process of its own: a stream that crashes the decoder, or never ends, costs that image only.
 
-`DecodeWorker` starts `python -m sonarpost.archive.decode_worker`, writes a coded image to its standard input and reads
-the decoded one from its standard output. Messages have a length of four bytes before them. The first one is empty: the
-process is ready. It ends when its standard input is closed, also if its parent is killed.
+`DecodeWorker` starts `python -m sonarpost.archive.decode_worker`, writes the part of an image as c2 has accepted it to
+its standard input, and reads the decoded image from its standard output. Messages have a length of four bytes before
+them. The first one is empty: the process is ready. It ends when its standard input is closed, also if its parent is
+killed.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ from typing import IO, Final, Literal
 import msgpack
 
 from sonarpost import wire
+from sonarpost.archive import image_parts
 from sonarpost.archive.decoder import Decoder
 from sonarpost.codec.jit import use_code_folder
 from sonarpost.codec.vq import codebook
 from sonarpost.errors import BadInputError, MissingCodebookError
 from sonarpost.limits import limit
 from sonarpost.logs import kv
-from sonarpost.messages import CodedImage, ReconstructedImage
+from sonarpost.messages import CodedImage, ImagePart, ReconstructedImage
 
 log = logging.getLogger(__name__)
 
@@ -98,8 +100,8 @@ class DecodeWorker:
         process = self._process
         return None if process is None else process.pid
 
-    def decode(self, image: CodedImage) -> Decoded:
-        """Decode an image."""
+    def decode(self, vessel_id: str, payload: bytes) -> Decoded:
+        """Decode an accepted image of a vessel."""
         is_new = False
         with self._lock:
             if self._closed:
@@ -120,7 +122,7 @@ class DecodeWorker:
         try:
             is_ready = is_ready or _read(process.stdout) is not None
             if is_ready:
-                _write(process.stdin, wire.encode(image))
+                _write(process.stdin, msgpack.packb((vessel_id, payload)))
                 answer = _read(process.stdout)
         except (OSError, ValueError):
             answer = None  # the process has ended, or `close` has closed its pipes
@@ -132,7 +134,7 @@ class DecodeWorker:
         fields = msgpack.unpackb(answer)
         if "payload" not in fields:
             return Decoded(reason=fields["reason"], missing_model=fields["model"])
-        return Decoded(wire.decode(ReconstructedImage, fields["payload"], f"image {image.image_id}"))
+        return Decoded(wire.decode(ReconstructedImage, fields["payload"], f"image of {vessel_id}"))
 
     def _ended(self, status: int, *, is_ready: bool) -> Decoded:
         if not is_ready:
@@ -177,11 +179,21 @@ def _read(file: IO[bytes]) -> bytes | None:
     return data if len(data) == length else None
 
 
+def coded_image(vessel_id: str, payload: bytes) -> CodedImage:
+    """Return the coded image of an accepted part.
+
+    Raises:
+        PayloadError: It is invalid.
+    """
+    where = f"image of {vessel_id}"
+    return image_parts.coded_image(wire.decode(ImagePart, payload, where), vessel_id, where)
+
+
 def _decode(decoder: Decoder, folder: Path, payload: bytes) -> dict[str, object]:
     """Return the answer for one image; a codebook that is missing is looked for in the folder."""
-    image = wire.decode(CodedImage, payload, "decode worker")
-    path = folder / image.vessel_id / f"{image.model}{codebook.SUFFIX}"
     try:
+        image = coded_image(*msgpack.unpackb(payload))
+        path = folder / image.vessel_id / f"{image.model}{codebook.SUFFIX}"
         further = None
         if image.model and decoder.codebook(image.model) is None and path.is_file():
             try:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sonarpost.archive.address import SCHEME, DatabaseAddress
 from sonarpost.archive.image_files import SUFFIXES
-from sonarpost.archive.rows import DecisionRow, ImageRow
+from sonarpost.archive.rows import ImageRow
 from sonarpost.archive.shore_files import decision_name
 
 if TYPE_CHECKING:
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 ArchivePlace = Path | DatabaseAddress
 """Folder of c2, or address of its database."""
 COMMAND_TIMEOUT_S = 60.0
-PART_IMAGES = 64
-"""Number of images in one part of a database."""
 
 
 def place_of(text: str, where: str) -> ArchivePlace:
@@ -106,42 +104,13 @@ def as_folder(place: ArchivePlace, suffixes: Collection[str] = SUFFIXES) -> Iter
     if isinstance(place, Path):
         yield place
         return
-    with open_reader(place) as archive, tempfile.TemporaryDirectory(prefix="sonarpost-archive-") as name:
-        _copy(archive, archive.images(), archive.decisions(), Path(name), suffixes)
-        yield Path(name)
-
-
-def archive_parts(place: ArchivePlace) -> Iterator[Path]:
-    """Yield the archive as folders, one after the other: the folder itself, or copies of parts of a database.
-
-    Raises:
-        StoredFileError: The database has no archive of this version.
-        DeliveryError, OSError: It cannot be read, or the copy cannot be written.
-    """
-    if isinstance(place, Path):
-        yield place
-        return
-    with open_reader(place) as archive:
-        rows = archive.images()
-        for first in range(0, len(rows) + 1, PART_IMAGES):
-            part = rows[first : first + PART_IMAGES]
-            is_last = first + PART_IMAGES > len(rows)
-            with tempfile.TemporaryDirectory(prefix="sonarpost-archive-") as name:
-                _copy(archive, part, archive.decisions() if is_last else (), Path(name), SUFFIXES)
-                yield Path(name)
-
-
-def _copy(
-    archive: ShoreArchive,
-    images: Iterable[ImageRow],
-    decisions: Iterable[DecisionRow],
-    folder: Path,
-    suffixes: Collection[str],
-) -> None:
-    names = [(row.vessel_id, row.name, [s for s in SUFFIXES if s in suffixes]) for row in images]
-    names += [(row.vessel_id, decision_name(row.decision_id), [SUFFIXES[0]]) for row in decisions]
-    for vessel_id, name, wanted in names:
-        for suffix, content in archive.read_files(vessel_id, name, wanted).items():
-            path = folder / vessel_id / f"{name}{suffix}"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content)
+    with open_reader(place) as archive, tempfile.TemporaryDirectory(prefix="sonarpost-archive-") as folder:
+        wanted = [suffix for suffix in SUFFIXES if suffix in suffixes]
+        names = [(row.vessel_id, row.name, wanted) for row in archive.images()]
+        names += [(row.vessel_id, decision_name(row.decision_id), [SUFFIXES[0]]) for row in archive.decisions()]
+        for vessel_id, name, wanted in names:
+            for suffix, content in archive.read_files(vessel_id, name, wanted).items():
+                path = Path(folder, vessel_id, f"{name}{suffix}")
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(content)
+        yield Path(folder)

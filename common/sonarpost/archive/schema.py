@@ -58,7 +58,7 @@ IMAGE: Final = _table(
 FILE: Final = _table(
     "file", {"vessel_id": sa.Text, "name": sa.Text, "suffix": sa.Text}, {"content": sa.LargeBinary}, {}
 )
-"""Files of images and decisions; of an archive with a folder only those that are not in the folder yet."""
+"""Files of images and decisions of an archive without a folder."""
 
 DECISION: Final = _table(
     "decision",

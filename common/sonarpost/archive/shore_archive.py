@@ -1,8 +1,8 @@
 """Archive of a shore site: images, decisions, tasking, their numbers, and records that are accepted and not stored yet.
 
-The database is authoritative. One transaction has the row of an image, its number and the end of its acceptance. Files
-follow the transaction: in an archive with a folder, the database has their content until they are in the folder, so
-that they are completed after a crash. An archive without a folder keeps them in the database.
+The database is authoritative. One transaction has the row of an image, its number and the end of its acceptance. Before
+it, the files are written into the folder: after a crash in between, the record is handled again and replaces them. An
+archive without a folder keeps them in the database.
 
 Several c2 can share an archive in PostgreSQL. Unique keys and digests make every write idempotent: the same record
 again is a repetition; another content under the same key is not written.
@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import sqlalchemy as sa
 
@@ -99,9 +99,6 @@ class ShoreArchive:
         self._owner = owner
         self._lock = threading.RLock()
         """Held while files are written, compared or deleted."""
-        self._is_complete = False
-        self._written: list[Name] = []
-        """Files that are in the folder and still in the database."""
         insert = database.insert
         image, decision, tasking, file = insert(IMAGE), insert(DECISION), insert(TASKING), insert(FILE)
         self._put_images = image.on_conflict_do_update(
@@ -134,28 +131,26 @@ class ShoreArchive:
     # Writes
 
     def write(self, batch: Batch) -> list[Accepted]:
-        """Write everything in one transaction, then the files into the folder.
+        """Write the files into the folder, then everything else in one transaction.
 
         Returns:
             Numbers of the records for the journal.
 
         Raises:
-            OSError, DatabaseUnavailableError: The transaction has failed; or another c2 has written another content
-                under one of the names at the same time, which the next search finds; or the files cannot be written:
-                the next call writes them.
+            OSError, DatabaseUnavailableError: The files cannot be written; or the transaction has failed; or another c2
+                has written another content under one of the names at the same time, which the next search finds.
         """
         files = [
-            {"vessel_id": i.row.vessel_id, "name": i.row.name, "suffix": suffix, "content": content}
+            (i.row.vessel_id, i.row.name, suffix, content)
             for i in sorted(batch.images, key=lambda i: (i.row.vessel_id, i.row.name))
             for suffix, content in i.files
         ]
-        for row, content in batch.decisions:
-            name = decision_name(row.decision_id)
-            files.append({"vessel_id": row.vessel_id, "name": name, "suffix": SUFFIXES[0], "content": content})
+        files += [(d.vessel_id, decision_name(d.decision_id), SUFFIXES[0], content) for d, content in batch.decisions]
         with self._lock:
-            self.complete_files()
+            if self.folder is not None:
+                write_files(self.folder, files)
+                files = []
             with self.database.transaction() as sql:
-                _delete(sql, FILE, self._written)
                 for table in (FILE, IMAGE, RECORD):
                     _delete(sql, table, batch.replaced)
                 if batch.images:
@@ -164,7 +159,8 @@ class ShoreArchive:
                     rows = [row for row, _ in batch.decisions]
                     self._write_rows(sql, self._put_decisions, rows, "decision under the same identifier")
                 if files:
-                    self.database.put(sql, self._put_files, files)
+                    columns = ("vessel_id", "name", "suffix", "content")
+                    self.database.put(sql, self._put_files, [dict(zip(columns, file, strict=True)) for file in files])
                 if batch.tasking:
                     values = [values_of(row) | {"owner": self._owner, "payload": b""} for row in batch.tasking]
                     self.database.put(sql, self._put_tasking, values)
@@ -175,37 +171,12 @@ class ShoreArchive:
                     self.backlog.count_waiting(sql)
                 # At last, because other c2 wait for it until the commit.
                 numbers = self.journal.number(sql, batch.numbered)
-            self._written = []
-            if self.folder and files:
-                self._write_to_folder(files)
         return numbers
 
     def _write_rows(self, sql: sa.Connection, statement: sa.Insert, rows: Sequence[Row], what: str) -> None:
         values = sorted((values_of(row) for row in rows), key=lambda v: (v["vessel_id"], v.get("name", "")))
         if self.database.put(sql, statement, values) != len(rows):
             raise DatabaseUnavailableError(f"another c2 has stored another {what}; trying again")
-
-    def complete_files(self) -> None:
-        """Write the files that were not written to the folder before a crash or because of a fault."""
-        with self._lock:
-            while self.folder is not None and not self._is_complete:
-                with self.database.transaction(writing=False) as sql:
-                    name = sql.execute(sa.select(FILE.c.vessel_id, FILE.c.name).limit(1)).first()
-                    found = sql.execute(sa.select(FILE).where(_named(FILE)), {"names": [tuple(name)]}) if name else ()
-                    files = [row._asdict() for row in found]
-                self._write_to_folder(files)
-                if not files:
-                    break
-                self._is_complete = False  # there can be more
-                with self.database.transaction() as sql:
-                    _delete(sql, FILE, self._written)
-
-    def _write_to_folder(self, files: Sequence[Mapping[str, Any]]) -> None:
-        assert self.folder is not None
-        self._is_complete = False
-        write_files(self.folder, [(f["vessel_id"], f["name"], f["suffix"], f["content"]) for f in files])
-        self._written = sorted({(f["vessel_id"], f["name"]) for f in files})
-        self._is_complete = True
 
     def adopt_numbers(self, source: ShoreArchive) -> int:
         """Add the records of the journal of another archive, and return the number of added ones.
@@ -235,18 +206,15 @@ class ShoreArchive:
 
     def find_image(self, vessel_id: str, name: str) -> tuple[str, bool] | None:
         """Return the SHA-256 digest of an image's JSON file, and whether its files are stored; None for no image."""
-        chosen = sa.select(IMAGE.c.files_sha256, IMAGE.c.removed_utc_s.is_(None) & (IMAGE.c.fault == ""))
         with self.database.transaction(writing=False) as sql:
-            found = sql.execute(chosen.where(_is_image(IMAGE)), {"vessel": vessel_id, "name": name}).first()
+            found = sql.execute(_FIND_IMAGE, {"vessel": vessel_id, "name": name}).first()
         return None if found is None else (found[0].partition(" ")[0], bool(found[1]))
 
     def find_decision(self, vessel_id: str, decision_id: str) -> str | None:
         """Return the SHA-256 digest of a decision's content; None if there is none."""
-        chosen = sa.select(DECISION.c.files_sha256).where(
-            DECISION.c.vessel_id == vessel_id, DECISION.c.decision_id == decision_id
-        )
         with self.database.transaction(writing=False) as sql:
-            return sql.execute(chosen).scalar_one_or_none()
+            found = sql.execute(_FIND_DECISION, {"vessel": vessel_id, "decision": decision_id})
+            return found.scalar_one_or_none()
 
     def images(self, *, removed: bool = False) -> list[ImageRow]:
         """Return all versions of all images, oldest first; removed ones only if `removed`."""
@@ -273,19 +241,15 @@ class ShoreArchive:
         Raises:
             StoredFileError: A file is missing or cannot be read.
         """
+        if self.folder is not None:
+            return {suffix: _read(self.folder / vessel_id / f"{name}{suffix}") for suffix in suffixes}
         chosen = sa.select(FILE.c.suffix, FILE.c.content).where(_is_image(FILE))
         with self.database.transaction(writing=False) as sql:
-            found = {s: c for s, c in sql.execute(chosen, {"vessel": vessel_id, "name": name}) if s in suffixes}
+            rows = sql.execute(chosen, {"vessel": vessel_id, "name": name})
+            found = {suffix: content for suffix, content in rows if suffix in suffixes}
         for suffix in suffixes:
-            if suffix in found:
-                continue
-            if self.folder is None:
+            if suffix not in found:
                 raise StoredFileError(self.database.where, "file", f"{vessel_id}/{name}{suffix}", "a stored file")
-            path = self.folder / vessel_id / f"{name}{suffix}"
-            try:
-                found[suffix] = read_regular(path, MAX_FILE_BYTES)
-            except OSError as error:
-                raise StoredFileError(str(path), "", error.strerror or str(error), "a readable file of c2") from error
         return found
 
     def mark(self, column: MarkColumn, images: Iterable[ImageRow], at_utc_s: float) -> list[ImageRow]:
@@ -419,6 +383,13 @@ class ShoreArchive:
             return sql.execute(chosen).scalar_one_or_none()
 
 
+def _read(path: Path) -> bytes:
+    try:
+        return read_regular(path, MAX_FILE_BYTES)
+    except OSError as error:
+        raise StoredFileError(str(path), "", error.strerror or str(error), "a readable file of c2") from error
+
+
 def _side_car(columns: sa.ColumnCollection[str, Any]) -> sa.ColumnElement[str]:
     """Return the digest of the JSON file, the first of `files_sha256`."""
     return sa.func.substr(columns.files_sha256, 1, 64)
@@ -431,6 +402,14 @@ def _is_image(table: sa.Table) -> sa.ColumnElement[bool]:
 def _named(table: sa.Table) -> sa.ColumnElement[bool]:
     """Return the condition that a row has one of the `names`."""
     return sa.tuple_(table.c.vessel_id, table.c.name).in_(sa.bindparam("names", expanding=True))
+
+
+_FIND_IMAGE: Final = sa.select(IMAGE.c.files_sha256, IMAGE.c.removed_utc_s.is_(None) & (IMAGE.c.fault == "")).where(
+    _is_image(IMAGE)
+)
+_FIND_DECISION: Final = sa.select(DECISION.c.files_sha256).where(
+    DECISION.c.vessel_id == sa.bindparam("vessel"), DECISION.c.decision_id == sa.bindparam("decision")
+)
 
 
 def _delete(sql: sa.Connection, table: sa.Table, names: Sequence[Name]) -> None:

@@ -13,7 +13,7 @@ from builders.common import eventually
 from sonarpost import keys, wire
 from sonarpost.archive import decode_worker
 from sonarpost.archive.backlog import BacklogRecord
-from sonarpost.archive.decode_worker import Decoded, DecodeWorker
+from sonarpost.archive.decode_worker import Decoded, DecodeWorker, coded_image
 from sonarpost.archive.decoder import Decoder
 from sonarpost.archive.reader import open_archive
 from sonarpost.archive.shore_archive import Batch
@@ -56,7 +56,8 @@ class Backlog:
             self.archive.write(Batch(waiting=[BacklogRecord(key, wire.encode(part), vessel)]))
         self.decoding.wake()
 
-    def decode(self, image):
+    def decode(self, vessel_id, payload):
+        image = coded_image(vessel_id, payload)
         name = f"{image.vessel_id}/{image.image_id}"
         self.tried.append(name)
         self.faults.add(self.decoding.fault)
@@ -71,7 +72,7 @@ class Backlog:
 
     def _quarantined(self, entry):
         self.archive.backlog.discard([entry])
-        self.quarantined.append(f"{entry.vessel_id}/{decoding.coded_image(entry).image_id}")
+        self.quarantined.append(f"{entry.vessel_id}/{coded_image(entry.vessel_id, entry.payload).image_id}")
 
     def close(self):
         """As a worker: nothing to end."""
@@ -244,19 +245,19 @@ def worker(tmp_path):
 def coded(texture):
     stream = default_registry().create("emb").encode(texture(), 200)
     part = ImagePart(u="uuv-1", i="0001", n=1, t=1.7e9, p=stream)
-    return decoding.coded_image(BacklogRecord("key", wire.encode(part), "vessel-1"))
+    return "vessel-1", wire.encode(part)
 
 
 @pytest.mark.system
 def test_end_of_a_decoder_is_blamed_on_the_machine_unless_it_ends_by_itself(worker, coded, tmp_path):
-    assert worker(str(tmp_path / "missing.tiles")).decode(coded).failure == "machine"
+    assert worker(str(tmp_path / "missing.tiles")).decode(*coded).failure == "machine"
     for number, failure in ((signal.SIGKILL, "machine"), (signal.SIGTERM, "machine"), (signal.SIGSEGV, "crash")):
         decoder = worker()
-        assert decoder.decode(coded).image is not None
+        assert decoder.decode(*coded).image is not None
         os.kill(decoder.pid, number)
-        result = decoder.decode(coded)
+        result = decoder.decode(*coded)
         assert (result.image, result.failure) == (None, failure)
-        assert decoder.decode(coded).image is not None
+        assert decoder.decode(*coded).image is not None
 
 
 @pytest.mark.system
@@ -264,10 +265,10 @@ def test_decoder_that_does_not_finish_is_ended_after_its_processor_time(worker, 
     # The kernel counts processor time in ticks: the decoding must last longer than one.
     stream = default_registry().create("emb").encode(texture(512, 512), 20_000)
     part = ImagePart(u="uuv-1", i="0001", n=1, t=1.7e9, p=stream)
-    coded = decoding.coded_image(BacklogRecord("key", wire.encode(part), "vessel-1"))
+    payload = wire.encode(part)
     before = signal.signal(signal.SIGPROF, signal.SIG_IGN)  # children inherit it
     try:
-        result = worker(max_decode_s=1e-6).decode(coded)
+        result = worker(max_decode_s=1e-6).decode("vessel-1", payload)
     finally:
         signal.signal(signal.SIGPROF, before)
     assert (result.failure, result.reason) == ("crash", "the decoder did not finish within 1e-06 s of processor time")
@@ -277,7 +278,7 @@ def test_decoder_that_does_not_finish_is_ended_after_its_processor_time(worker, 
 @pytest.mark.parametrize("step", ["_write", "_read"])
 def test_stop_between_two_steps_of_a_decoding_is_no_crash(worker, coded, monkeypatch, step):
     decoder = worker()
-    assert decoder.decode(coded).image is not None
+    assert decoder.decode(*coded).image is not None
     original = getattr(decode_worker, step)
 
     def stopped(*arguments):
@@ -285,5 +286,5 @@ def test_stop_between_two_steps_of_a_decoding_is_no_crash(worker, coded, monkeyp
         return original(*arguments)
 
     monkeypatch.setattr(decode_worker, step, stopped)
-    assert decoder.decode(coded).failure == "machine"
-    assert decoder.decode(coded).reason == "the service stops"
+    assert decoder.decode(*coded).failure == "machine"
+    assert decoder.decode(*coded).reason == "the service stops"

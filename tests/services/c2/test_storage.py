@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 from builders.records import command_record, decision_record
@@ -146,10 +147,17 @@ def test_state_of_a_command_is_replaced(archive):
     assert archive.index().tasking() == [delivered.row()]
 
 
-def test_preview_is_replaced_by_the_whole_and_does_not_replace_it(archive):
+@pytest.mark.parametrize("is_interrupted", [False, True])
+def test_preview_is_replaced_by_the_whole_and_does_not_replace_it(archive, monkeypatch, is_interrupted):
     preview, whole = image(notes=(PREVIEW_NOTE,)), image(value=2)
     archive.store_image(preview, 5.0)
     [(_, first)] = archive.flush()
+    if is_interrupted:
+        with monkeypatch.context() as patch:
+            patch.setattr(archive.shore.journal, "number", Mock(side_effect=OSError("before the commit")))
+            archive.store_image(whole, 5.0)
+            with pytest.raises(OSError, match="before the commit"):
+                archive.flush()
     assert archive.store_image(whole, 5.0)[1:] == (True, False)
     [(entry, second)] = archive.flush()
     assert second.seq > first.seq, "its number is new, so that subscribers receive it"
