@@ -14,7 +14,8 @@ import tempfile
 import threading
 import time
 import urllib.request
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from functools import partial
 from http.client import HTTPResponse
 from pathlib import Path
@@ -48,34 +49,44 @@ def main() -> None:
     parser.add_argument("--contacts", type=int, default=5000)
     parser.add_argument("--versions", type=int, default=200, help="number of new versions, published one after another")
     parsed = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="sonarpost-bench-") as folder:
-        endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-        with zenoh.open(router_config([endpoint])):
-            measure(endpoint, Path(folder), parsed.contacts, parsed.versions)
-
-
-def measure(endpoint: str, folder: Path, contacts: int, versions: int) -> None:
-    """Run the service and a client."""
-    with closing(Users(folder / FILE_NAME)) as users:
-        users.add("bench", "operator", PASSWORD)
-    service = ConsoleService(PlatformConfig(id=VESSEL, router=(endpoint,), state_dir=folder), ConsoleConfig(port=0))
-    assert service.start()
-    try:
-        empty_mb = resident_mb()
-        started_s = time.perf_counter()
-        TrainingSimulator(service.state, contacts).load_backlog(contacts)
-        print(f"{contacts} contacts in {time.perf_counter() - started_s:.0f} s")
-        print(f"memory: {empty_mb:.0f} MB empty, {resident_mb():.0f} MB filled (codecs and simulation included)")
-        browser = Browser(service.address)
+    with filled_console(parsed.contacts) as (address, endpoint, _):
+        browser = Browser(address)
         for query in LISTS:
             show(f"list {query}", [browser.timed(f"api/contacts?{query}") for _ in range(50)])
         show("map", [browser.timed("api/map") for _ in range(20)])
         show("KMZ of all contacts", [browser.timed("api/export/contacts.kmz")])
         before_mb = resident_mb()
-        show("published to event", latencies(endpoint, browser, versions))
-        print(f"memory: {before_mb:.0f} MB before, {resident_mb():.0f} MB after {versions} versions and the lists")
-    finally:
-        service.stop()
+        show("published to event", latencies(endpoint, browser, parsed.versions))
+        print(
+            f"memory: {before_mb:.0f} MB before, {resident_mb():.0f} MB after {parsed.versions} versions and the lists"
+        )
+
+
+@contextmanager
+def filled_console(contacts: int) -> Iterator[tuple[str, str, Users]]:
+    """Run a router and the service with simulated contacts.
+
+    Yields:
+        The address of the page, the endpoint of the router, and the users, of which `bench` has `PASSWORD`.
+    """
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    with tempfile.TemporaryDirectory(prefix="sonarpost-bench-") as folder, zenoh.open(router_config([endpoint])):
+        platform = PlatformConfig(id=VESSEL, router=(endpoint,), state_dir=Path(folder))
+        with closing(Users(Path(folder) / FILE_NAME)) as users:
+            users.add("bench", "operator", PASSWORD)
+            service = ConsoleService(platform, ConsoleConfig(port=0))
+            assert service.start()
+            try:
+                empty_mb = resident_mb()
+                started_s = time.perf_counter()
+                TrainingSimulator(service.state, contacts).load_backlog(contacts)
+                print(f"{contacts} contacts in {time.perf_counter() - started_s:.0f} s")
+                print(
+                    f"memory: {empty_mb:.0f} MB empty, {resident_mb():.0f} MB filled (codecs and simulation included)"
+                )
+                yield service.address, endpoint, users
+            finally:
+                service.stop()
 
 
 class Browser:
@@ -142,7 +153,7 @@ def resident_mb() -> float:
     return int(line.split()[1]) / 1024
 
 
-def show(name: str, times_s: list[float]) -> None:
+def show(name: str, times_s: Sequence[float]) -> None:
     """Print median, 95th percentile and maximum."""
     ordered = sorted(1e3 * at for at in times_s)
     slow_ms = ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))]

@@ -10,25 +10,19 @@ those of this host.
 import argparse
 import os
 import shutil
-import statistics
-import tempfile
 import time
-from pathlib import Path
+from contextlib import closing
 from urllib.parse import urlsplit
 
 import zenoh
 from playwright.sync_api import Page, sync_playwright
 
-from research.common.ports import free_ports
+from research.console_scale import filled_console, show
 from sonarpost import keys, wire
-from sonarpost.bus.session import client_config, router_config
-from sonarpost.config import PlatformConfig
+from sonarpost.bus.session import client_config
 from sonarpost.extensions.training.contacts import simulated_contacts
-from sonarpost.extensions.training.simulator import VESSEL, TrainingSimulator
+from sonarpost.extensions.training.simulator import VESSEL
 from sonarpost.messages import ReconstructedImage
-from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.service import ConsoleService
-from sonarpost.services.console.store.users import FILE_NAME, Users
 from sonarpost.services.console.web.access import COOKIE, cookie_name
 
 # Time of the first row, in ms since the start of the navigation; time of an awaited change, in ms since 1970.
@@ -65,35 +59,16 @@ def main() -> None:
     chromium = os.environ.get("SONARPOST_CHROMIUM") or shutil.which("chromium")
     if chromium is None:
         raise SystemExit("no Chromium: apt-get install chromium, or set SONARPOST_CHROMIUM")
-    with tempfile.TemporaryDirectory(prefix="sonarpost-bench-") as folder, sync_playwright() as playwright:
-        endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-        router = zenoh.open(router_config([endpoint]))
-        platform = PlatformConfig(id=VESSEL, router=(endpoint,), state_dir=Path(folder))
-        users = Users(Path(folder) / FILE_NAME)
-        users.add("bench", "operator", "a password for the benchmark")
-        service = ConsoleService(platform, ConsoleConfig(port=0))
-        if not service.start():
-            raise SystemExit("the service did not start")
-        started_s = time.monotonic()
-        TrainingSimulator(service.state, parsed.contacts).load_backlog(parsed.contacts)
-        print(f"{parsed.contacts} contacts simulated and stored in {time.monotonic() - started_s:.0f} s")
+    with filled_console(parsed.contacts) as (address, endpoint, users), sync_playwright() as playwright:
         arguments = ["--enable-precise-memory-info", *(["--no-sandbox"] if os.geteuid() == 0 else [])]
         browser = playwright.chromium.launch(executable_path=chromium, args=arguments)
         context = browser.new_context(viewport={"width": 1366, "height": 768})
         token = users.start_session("bench").token
-        context.add_cookies(
-            [{"name": cookie_name(COOKIE, urlsplit(service.address).netloc), "value": token, "url": service.address}]
-        )
+        context.add_cookies([{"name": cookie_name(COOKIE, urlsplit(address).netloc), "value": token, "url": address}])
         page = context.new_page()
         page.add_init_script(f"({WATCH})()")
-        try:
-            with zenoh.open(client_config([endpoint])) as session:
-                measure(page, service.address, session, parsed.changes)
-        finally:
-            browser.close()
-            users.close()
-            service.stop()
-            router.close()
+        with closing(browser), zenoh.open(client_config([endpoint])) as session:
+            measure(page, address, session, parsed.changes)
 
 
 def measure(page: Page, address: str, session: zenoh.Session, changes: int) -> None:
@@ -102,7 +77,7 @@ def measure(page: Page, address: str, session: zenoh.Session, changes: int) -> N
     for _ in range(10):
         page.goto(address)
         page.wait_for_function("() => window.firstRow_ms !== null")
-        opened.append(float(page.evaluate("window.firstRow_ms")))
+        opened.append(float(page.evaluate("window.firstRow_ms")) / 1000)
     show("page opened to list drawn", opened)
     page.wait_for_function("() => document.body.dataset.online === 'true'")
     simulated = next(simulated_contacts(7, time.time()))
@@ -137,19 +112,12 @@ def measure(page: Page, address: str, session: zenoh.Session, changes: int) -> N
 
 
 def published_to(page: Page, session: zenoh.Session, record: ReconstructedImage, test: str, argument: str) -> float:
-    """Publish an image; return the time in ms until its change is drawn."""
+    """Publish an image; return the time until its change is drawn."""
     payload = wire.encode(record)
     handle = page.evaluate_handle("([test, argument]) => ({drawn: window.whenDrawn(test, argument)})", [test, argument])
     started_s = time.time()
     session.put(keys.image_reconstructed(VESSEL), payload, encoding=wire.encoding_of(ReconstructedImage))
-    return float(handle.evaluate("one => one.drawn")) - 1000 * started_s
-
-
-def show(name: str, times_ms: list[float]) -> None:
-    """Print median, 95th percentile and maximum."""
-    ordered = sorted(times_ms)
-    slow_ms = ordered[min(len(ordered) - 1, int(0.95 * len(ordered)))]
-    print(f"{name}: p50 {statistics.median(ordered):.0f} ms, p95 {slow_ms:.0f} ms, most {ordered[-1]:.0f} ms")
+    return float(handle.evaluate("one => one.drawn")) / 1000 - started_s
 
 
 if __name__ == "__main__":

@@ -79,7 +79,6 @@ class RequestRun:
         asked_s: Time of the request.
         arrived_s: Time of the answer; None if none came.
         airtime_s: Air time of all packets between them.
-        log: Time and event of each packet after the request.
     """
 
     def __init__(self, spec: RequestSpec) -> None:
@@ -104,7 +103,6 @@ class RequestRun:
         self._is_asked = False
         self.arrived_s: float | None = None
         self.airtime_s = 0.0
-        self.log: list[tuple[float, str]] = []
 
     def _wait_s(self) -> float:
         mean_s = self._spec.contact_every_s
@@ -147,10 +145,6 @@ class RequestRun:
             image = ImageToSend(image_of_number(number), f"c{shown}", contact, self._rng.bytes(length))
             self._vehicle.queue.add_image(image, now)
 
-    def _note(self, now: float, text: str) -> None:
-        if self._is_asked:
-            self.log.append((now - self.asked_s, text))
-
     # The channel
 
     def _collides(self, mine: _Packet | None, other: _Packet) -> bool:
@@ -175,7 +169,6 @@ class RequestRun:
             self._arriving.remove((is_up, packet))
             collides = self._collides(self._down if is_up else self._up, packet)
             kept = [frame for frame in packet.frames if self._rng.random() >= self._spec.loss and not collides]
-            self._note(now, f"{'up' if is_up else 'down'} {len(kept)}/{len(packet.frames)}{' collision' * collides}")
             if is_up:
                 self._receive_up(kept, now)
             elif kept:
@@ -186,8 +179,6 @@ class RequestRun:
         for frame in frames:
             self._gate.frame_received(now)
             content = self._vessel.endpoint.accept(_VEHICLE, frame, now)
-            for command in content.commands:
-                self._note(now, f"{command.state}")
             for update in content.images:
                 long_enough = self._spec.kind != "refine" or update.received_bytes > _STREAM_BYTES + 30
                 if self._is_asked and update.image_id == image_of_number(self._answer) and update.complete:
@@ -196,10 +187,8 @@ class RequestRun:
     def _receive_down(self, frames: Sequence[bytes], now: float) -> None:
         for frame in frames:
             self._vehicle.receive(_VESSEL, frame, now)
-            if self._vehicle.take_effects().counts["commands_received"]:
-                self._note(now, "command received")
-                if self._spec.kind == "expand":
-                    self._due.append((now + _CODING_S, self._answer, _STREAM_BYTES))
+            if self._vehicle.take_effects().counts["commands_received"] and self._spec.kind == "expand":
+                self._due.append((now + _CODING_S, self._answer, _STREAM_BYTES))
 
     # The stations
 
@@ -234,7 +223,6 @@ class RequestRun:
         rate = self._op.rate_info(self._op.downlink_rate)
         packet = self._vessel.endpoint.next_packet(rate.frames, rate.frame_bytes, now)
         if packet is not None:
-            self._note(now, f"send {'command ' * len(packet.tokens)}{'feedback' * packet.has_feedback}")
             self._down = self._transmit(rate, packet.frames, now, is_up=False)
             self._down.sent = packet
 
@@ -249,21 +237,14 @@ def new_parser() -> argparse.ArgumentParser:
     parser = command_parser("request_times", "time from a request to its answer, simulated")
     parser.add_argument("--runs", type=int, default=30, help="runs with other seeds (%(default)s)")
     parser.add_argument("--loss", type=float, default=LOST_FRAMES, help="share of frames lost (%(default)s)")
-    parser.add_argument("--log", type=int, help="print the events of the run with this seed")
     return parser
 
 
 def run(args: argparse.Namespace) -> int:
     """Run requests and print the times to the answer."""
-    if args.log is None:
-        print(f"{'request':8} {'contacts':>8} {'median s':>8} {'90 %':>7} {'longest':>7} {'air s':>7}")
+    print(f"{'request':8} {'contacts':>8} {'median s':>8} {'90 %':>7} {'longest':>7} {'air s':>7}")
     for kind in ("expand", "refine"):
         for every_s in (0.0, 120.0):
-            if args.log is not None:
-                found = run_request(RequestSpec(kind, args.loss, every_s, args.log))
-                print(kind, every_s, found.arrived_s and found.arrived_s - found.asked_s)
-                print("\n".join(f"  {at_s:7.1f} {text}" for at_s, text in found.log))
-                continue
             runs = [run_request(RequestSpec(kind, args.loss, every_s, seed)) for seed in range(args.runs)]
             times_s = [(one.arrived_s or np.inf) - one.asked_s for one in runs]
             air_s = statistics.median(one.airtime_s for one in runs)

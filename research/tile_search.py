@@ -19,19 +19,16 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from research.common.patches import stretch
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.codec.interface import to_uint8
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.tiles import BASIS_SCALE, SHORTLIST, TileDatabase, Tiles, cut_tiles
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
-from sonarpost.sonar.image_files import read_image
 
 HEIGHT_PX, WIDTH_PX = 140, 80
 Search = Callable[[Tiles], npt.NDArray[np.int64]]
@@ -42,7 +39,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="VQ encode search against FAISS IndexFlatL2")
     parser.add_argument("--count", type=int, default=48, metavar="N", help="default: 48")
     parser.add_argument("--rounds", type=int, default=8, metavar="N", help="default: 8")
-    parser.add_argument("--images", type=Path, metavar="DIR", help="folder of images (default: simulated ones)")
     args = parser.parse_args()
     if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
         # The libraries read this when they are loaded, so the program restarts itself, on one core.
@@ -57,10 +53,7 @@ def main() -> int:
         return 2
     faiss.omp_set_num_threads(1)
     database = load_default(10).tiles
-    images = [cut_tiles(image, 10) for image in _images(args.images, args.count)]
-    if not images:
-        print(f"tile_search: no image of {WIDTH_PX} × {HEIGHT_PX} px or more in {args.images}", file=sys.stderr)
-        return 2
+    images = [cut_tiles(image, 10) for image in _images(args.count)]
     index = faiss.IndexFlatL2(database.dims)
     index.add(_coordinates(database, database.tiles))
     _choose_method(faiss, index, database, images)
@@ -136,13 +129,8 @@ def _choose_method(faiss: object, index: object, database: TileDatabase, images:
     settings.distance_compute_blas_threshold = min(times_s, key=lambda threshold: times_s[threshold])
 
 
-def _images(folder: Path | None, count: int) -> list[npt.NDArray[np.uint8]]:
-    """Return images of 80 x 140 px: centres of the images of a folder, or parts of simulated lines."""
-    if folder is not None:
-        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in (".png", ".tif", ".tiff"))
-        images = (to_uint8(read_image(path)) for path in paths)
-        usable = (image for image in images if image.shape[0] >= HEIGHT_PX and image.shape[1] >= WIDTH_PX)
-        return [_centre(image) for image in usable][:count]
+def _images(count: int) -> list[npt.NDArray[np.uint8]]:
+    """Return images of 80 x 140 px, parts of simulated lines."""
     cut: list[npt.NDArray[np.uint8]] = []
     for number in range(count):
         if number % 8 == 0:
@@ -152,11 +140,6 @@ def _images(folder: Path | None, count: int) -> list[npt.NDArray[np.uint8]]:
         top, left = 140 * (number % 8 // 2), 300 + 100 * (number % 4)
         cut.append(stretch(line[top : top + HEIGHT_PX, left : left + WIDTH_PX].astype(np.float64)))
     return cut
-
-
-def _centre(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    top, left = (image.shape[0] - HEIGHT_PX) // 2, (image.shape[1] - WIDTH_PX) // 2
-    return image[top : top + HEIGHT_PX, left : left + WIDTH_PX]
 
 
 if __name__ == "__main__":

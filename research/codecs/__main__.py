@@ -1,14 +1,12 @@
 """`python -m research.codecs`: quality, size and speed of every codec at every budget."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
-from research.codecs.report import curves, details, json_line, miss_lines, rate_differences, result_rows, text
+from research.codecs.report import details, json_line, miss_lines, rate_differences, result_rows, text
 from research.common.command import (
     add_codec_arguments,
     add_strength_argument,
@@ -22,28 +20,23 @@ from research.common.command import (
 from research.common.images import ImageSet, SampleImage, read_image_folder, sdvd_crops, simulated_images
 from research.common.measurement import (
     SHIPPED_CODEBOOKS,
-    BudgetResult,
     CodecUnderTest,
     code_image,
     measure_codec,
     scene_reference,
 )
-from research.common.plots import SheetCell, new_figure, save_figure, write_sheet
+from research.common.plots import SheetCell, write_sheet
 from research.common.quality import psnr_db
-from research.common.statistics import bootstrap_weights, finite_mean
+from research.common.statistics import bootstrap_weights
 from sonarpost.cli.shared import add_fit_option, in_new_folder
 from sonarpost.errors import ConfigError
 from sonarpost.files import write_atomically
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 T = TypeVar("T")
 
 _SIMULATED: Final = 48
 _SHEET_IMAGES: Final = 6
 _SHEET_BUDGETS: Final = 3
-_TICKS_BYTES: Final = (8, 16, 32, 64, 128, 256, 512, 1024, 2048)
 
 
 def new_parser() -> argparse.ArgumentParser:
@@ -58,15 +51,11 @@ def new_parser() -> argparse.ArgumentParser:
     source.add_argument("--sdvd", type=Path, metavar="DIR", help="the SDVD data set: crops of its test split")
     add_fit_option(parser)
     parser.add_argument(
-        "--crop", type=int, metavar="PX", help="side of the crops or simulated images (80); --images is SDVD then"
-    )
-    parser.add_argument(
         "--count", type=int, default=_SIMULATED, metavar="N", help="number of simulated images (default: %(default)s)"
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the simulated images (default: 0)")
     add_codec_arguments(parser)
     add_strength_argument(parser)
-    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw rate-distortion curves (needs matplotlib)")
     parser.add_argument(
         "--details", type=Path, metavar="FILE.json", help="write all figures: intervals, misses, variants"
     )
@@ -76,7 +65,6 @@ def new_parser() -> argparse.ArgumentParser:
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw images as decoded by each codec")
     parser.add_argument(
         "--codebooks",
-        "--catalogues",
         nargs="+",
         default=SHIPPED_CODEBOOKS,
         metavar="NAME_OR_FILE",
@@ -98,12 +86,10 @@ def selected_images(args: argparse.Namespace, *, with_scenes: bool = False) -> I
     """
     if not 0 <= args.seed <= 1_000_000:
         raise ConfigError("research", "--seed", args.seed, "0..1000000")
-    side_px: int = 80 if args.crop is None else args.crop
-    sdvd: Path | None = args.sdvd if args.crop is None or args.images is None else args.images
-    if sdvd is not None:
-        return sdvd_crops(sdvd, "test", side_px)
+    if args.sdvd is not None:
+        return sdvd_crops(args.sdvd)
     if args.images is None:
-        return simulated_images(args.count, args.seed, side_px, with_scenes=with_scenes)
+        return simulated_images(args.count, args.seed, with_scenes=with_scenes)
     found = read_image_folder(args.images, args.fit)
     for line in found.rejected:
         warn(f"rejected: {line}")
@@ -116,15 +102,13 @@ def run(args: argparse.Namespace) -> int:
     """Measure and report; return 0.
 
     Raises:
-        SonarpostError: Invalid options, folders or codecs; a plot without matplotlib.
+        SonarpostError: Invalid options, folders or codecs.
         OSError: A file cannot be written.
     """
     budgets = parse_budgets(args.budgets)
-    for path in (args.plot, args.sheet, args.details):
+    for path in (args.sheet, args.details):
         if path is not None:
             in_new_folder(path)
-    if args.plot is not None:
-        new_figure(1, 1)  # a missing extra is reported before the measurement
     tested = selected_codecs(args, cut=args.cut, codebooks=args.codebooks)
     with_scenes = args.json or args.details is not None  # the tables do not show these measures
     measured = selected_images(args, with_scenes=with_scenes)
@@ -135,10 +119,8 @@ def run(args: argparse.Namespace) -> int:
         for result in measure_codec(codec, measured.images, budgets, report_progress, references)
     ]
     weights = bootstrap_weights([image.source for image in measured.images])
-    title = f"{len(measured.images)} images of {measured.origin}"
-    if args.plot is not None:
-        save_figure(plot_rate_distortion(results, title), args.plot)
     if args.sheet is not None:
+        title = f"{len(measured.images)} images of {measured.origin}"
         write_sheet(args.sheet, title, sheet_rows(tested, measured.images, budgets))
     differences = rate_differences(results, weights)
     if args.details is not None:
@@ -180,42 +162,6 @@ def spread(items: Sequence[T], limit: int) -> list[T]:
     """Return at most `limit` items, evenly distributed from the first to the last."""
     count = min(limit, len(items))
     return [items[i * (len(items) - 1) // max(count - 1, 1)] for i in range(count)]
-
-
-def plot_rate_distortion(results: Sequence[BudgetResult], title: str) -> Figure:
-    """Draw PSNR, SSIM and MS-SSIM over bytes, one line a codec; a budget with misses has an open marker.
-
-    Raises:
-        ConfigError: matplotlib is not installed.
-    """
-    figure = new_figure(15, 4.6)
-    axes = figure.subplots(1, 3)
-    markers = "osD^v<>Phd"
-    for number, (name, curve) in enumerate(curves(results).items()):
-        coded = sorted((r for r in curve if r.hits.any()), key=lambda r: finite_mean(r.stream_bytes))
-        if not coded:
-            continue
-        rates = [finite_mean(r.stream_bytes) for r in coded]
-        marker = markers[number % len(markers)]
-        style = "none" if coded[0].tested.is_natural else "-"
-        for axis, metric in zip(axes, ("psnr", "ssim", "msssim"), strict=True):
-            means = [finite_mean(getattr(r, metric)) for r in coded]
-            (line,) = axis.plot(rates, means, linestyle=style, marker=marker, markersize=5, label=name)
-            with_misses = [(rate, mean) for r, rate, mean in zip(coded, rates, means, strict=True) if r.misses]
-            if with_misses:
-                x, y = zip(*with_misses, strict=True)
-                axis.plot(x, y, "none", marker=marker, markersize=5, mfc="white", mec=line.get_color(), linestyle="")
-    for axis, label in zip(axes, ("PSNR, dB", "SSIM", "MS-SSIM (3 scales)"), strict=True):
-        axis.set_xscale("log", base=2)
-        axis.set_xlabel("bytes an image, header included")
-        axis.set_ylabel(label)
-        axis.grid(visible=True, alpha=0.3)
-        low, high = axis.get_xlim()
-        ticks = [b for b in _TICKS_BYTES if low <= b <= high]
-        axis.set_xticks(ticks, [str(b) for b in ticks])
-    axes[0].legend(fontsize=8)
-    figure.suptitle(title, fontsize=11)
-    return figure
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
