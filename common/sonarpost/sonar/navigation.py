@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Final, TypeAlias
 
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
@@ -132,54 +132,55 @@ def apply_mounting(ping: Ping, mounting: Mounting) -> Ping:
     return replace(ping, lat_deg=position.lat_deg, lon_deg=position.lon_deg)
 
 
-@dataclass
-class PingCounter:
-    """Number of pings with an irregularity, and the row of the first."""
+def out_of_range(name: str) -> str:
+    """Return the note about an implausible value."""
+    return f"{name} out of range"
 
-    count: int = 0
-    first: int = -1
 
-    def add(self, row: int) -> None:
+class PingNotes:
+    """Irregularities of pings: of each the number of pings and the row of the first, by its text."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, tuple[int, int]] = {}
+
+    def add(self, text: str, row: int) -> None:
         """Count a ping."""
-        if not self.count:
-            self.first = row
-        self.count += 1
+        count, first = self._counts.get(text, (0, row))
+        self._counts[text] = (count + 1, first)
 
-    def summary(self, total: int) -> str:
-        """Return the count as text for a warning."""
-        return f"{self.count} of {total} pings, the first in row {self.first}"
+    def lines(self, total: int, texts: Iterable[str]) -> list[str]:
+        """Return a warning for each of these irregularities that one of `total` pings has."""
+        found = ((text, *self._counts[text]) for text in texts if text in self._counts)
+        return [f"{text} in {count} of {total} pings, the first in row {first}" for text, count, first in found]
 
 
-@dataclass
 class NavigationChecks:
     """Counts irregularities of the navigation, in constant memory."""
 
-    mounting: Mounting
-    _filter: PositionJumpFilter = field(default_factory=PositionJumpFilter)
-    _time_reversals: PingCounter = field(default_factory=PingCounter)
-    _jumps: PingCounter = field(default_factory=PingCounter)
-    _without_heading: PingCounter = field(default_factory=PingCounter)
-    _last_s: float = -math.inf
+    _TIME = "time goes back"
+    _JUMP = "position left out, too far from the one before,"
+    _NO_HEADING = "position left out, no heading to apply the mounting with,"
+
+    def __init__(self, mounting: Mounting) -> None:
+        self._mounting = mounting
+        self._filter = PositionJumpFilter()
+        self._notes = PingNotes()
+        self._last_s = -math.inf
 
     def observe(self, row: int, ping: Ping) -> None:
         """Check one ping as stored in the file."""
         if ping.time_utc_s < self._last_s:
-            self._time_reversals.add(row)
+            self._notes.add(self._TIME, row)
         self._last_s = ping.time_utc_s
         checked = self._filter.filter(ping)
         if ping.lat_deg is not None and checked.lat_deg is None:
-            self._jumps.add(row)
-        if self.mounting.is_offset and checked.lat_deg is not None and checked.heading_deg is None:
-            self._without_heading.add(row)
+            self._notes.add(self._JUMP, row)
+        if self._mounting.is_offset and checked.lat_deg is not None and checked.heading_deg is None:
+            self._notes.add(self._NO_HEADING, row)
 
     def warnings(self, total: int) -> list[str]:
         """Return one line for each kind of irregularity."""
-        texts = (
-            (self._time_reversals, "time goes back in"),
-            (self._jumps, "position left out, too far from the one before, in"),
-            (self._without_heading, "position left out, no heading to apply the mounting with, in"),
-        )
-        return [f"{text} {counter.summary(total)}" for counter, text in texts if counter.count]
+        return self._notes.lines(total, (self._TIME, self._JUMP, self._NO_HEADING))
 
 
 class HeadingChoice:

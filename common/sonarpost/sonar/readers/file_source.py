@@ -5,18 +5,20 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from typing_extensions import override
 
 from sonarpost.errors import SurveyFileError
-from sonarpost.sonar.navigation import PingCounter
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import GridExtent, extended
 from sonarpost.sonar.readers.open_file import CheckedFile
 from sonarpost.sonar.readers.records import Notes
 from sonarpost.sonar.source import StreamedSource
 from sonarpost.sonar.survey import Ping
+
+NO_FIX: Final = "no position fix"
+_NO_HEADING: Final = "no heading"
 
 
 class FileSource(StreamedSource):
@@ -31,14 +33,11 @@ class FileSource(StreamedSource):
 
     SONAR: ClassVar[str] = "unknown"
     """Name of the sonar, if the file has none."""
-    REPORTS_MISSING: ClassVar[bool] = True
-    """Whether a missing position or heading is a note."""
 
     def __init__(self, path: Path, options: SurveyOptions) -> None:
         super().__init__(path, options)
         self._files: list[CheckedFile] = []
         self._notes = Notes()
-        self._without_fix, self._without_heading = PingCounter(), PingCounter()
         self._extent: GridExtent | None = None
         self._pings = 0
         try:
@@ -76,7 +75,7 @@ class FileSource(StreamedSource):
         return ""
 
     @abstractmethod
-    def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
+    def _stored_pings(self, notes: Notes) -> Iterator[Ping]:
         """Yield the pings as stored in the file, and note irregularities."""
 
     @override
@@ -86,26 +85,24 @@ class FileSource(StreamedSource):
     @override
     def _format_warnings(self) -> list[str]:
         """Return the notes, and how many pings have no position fix or heading."""
-        texts = [(self._without_fix, "no position fix in")]
-        if self._heading_choice.source == "sensor":  # another source has a note of its own
-            texts.append((self._without_heading, "no heading in"))
-        missing = [f"{text} {counter.summary(self._pings)}" for counter, text in texts if counter.count]
+        # Another source of the heading has a note of its own.
+        texts = (NO_FIX, _NO_HEADING) if self._heading_choice.source == "sensor" else (NO_FIX,)
+        missing = self._notes.pings.lines(self._pings, texts)
         if self._extent is not None and self.options.projected_crs is None:
             missing[0] = "no positions: the file has projected metres; set the option projected_crs (--crs)"
-        return [*self._notes.warnings(), *(missing if self.REPORTS_MISSING else ())]
+        return [*self._notes.warnings(), *missing]
 
     @override
     def _read_pings(self, *, first_pass: bool) -> Iterator[Ping]:
         notes = self._notes if first_pass else Notes()
         row = 0
-        for ping in self._stored_pings(notes, first_pass=first_pass):
-            if first_pass:
-                if ping.grid_m is not None:
-                    self._extent = extended(self._extent, *ping.grid_m)
-                if ping.lat_deg is None:
-                    self._without_fix.add(row)
-                if ping.heading_deg is None:
-                    self._without_heading.add(row)
+        for ping in self._stored_pings(notes):
+            if first_pass and ping.grid_m is not None:
+                self._extent = extended(self._extent, *ping.grid_m)
+            if ping.lat_deg is None:
+                notes.pings.add(NO_FIX, row)
+            if ping.heading_deg is None:
+                notes.pings.add(_NO_HEADING, row)
             row += 1
             yield ping
         self._pings = row

@@ -35,7 +35,6 @@ from typing_extensions import override
 
 from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position
-from sonarpost.sonar.navigation import PingCounter
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers.file_source import FileSource
 from sonarpost.sonar.readers.joining import PingPart, joined
@@ -65,6 +64,7 @@ _SOLIX_DAT_BYTES: Final = (96, 100)
 _SOLIX_TIMES_S: Final = (946_684_800, 4_102_444_800)
 """2000 to 2100."""
 _MAX_DAT_BYTES: Final = 1 << 16
+_NO_DEPTH: Final = "no depth under the transducer"
 _RADIUS_M: Final = 6_378_388.0
 _GEODETIC: Final = 1.006_764_292_7
 """Ratio of the tangents of geodetic and geocentric latitude, International 1924: 1 / (1 - e^2)."""
@@ -97,7 +97,6 @@ class HumminbirdSource(FileSource):
 
     def __init__(self, path: Path, options: SurveyOptions) -> None:
         self._spacing_m = options.humminbird_sample_spacing_m or SAMPLE_SPACING_M
-        self._without_depth = PingCounter()
         self._unpaired = 0
         super().__init__(path, options)
 
@@ -138,23 +137,20 @@ class HumminbirdSource(FileSource):
             warnings.append(f"only the file of {self._sides[0].value} exists")
         elif self._unpaired:
             warnings.append(f"only one side in {self._unpaired} of {self._pings} pings")
-        depths = []
         if not self.options.humminbird_depth_as_altitude:
             warnings.append("echo sounder depth not used as altitude (option humminbird_depth_as_altitude)")
-        elif self._without_depth.count:
-            depths.append(f"no depth under the transducer in {self._without_depth.summary(self._pings)}")
-        return [*warnings, *super()._format_warnings(), *depths]
+        return [*warnings, *super()._format_warnings(), *self._notes.pings.lines(self._pings, [_NO_DEPTH])]
 
     @override
-    def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
+    def _stored_pings(self, notes: Notes) -> Iterator[Ping]:
         channels = [self._parts(side, file, notes) for side, file in zip(self._sides, self._files, strict=True)]
         parts = heapq.merge(*channels, key=lambda part: part.time_utc_s)
         for row, part in enumerate(joined(parts, max_gap_s=0.0, by_number=False)):
             ping = self._ping(part)
-            if first_pass:
+            if notes is self._notes:  # the first pass
                 self._unpaired += len(ping.channels) == 1
-                if ping.altitude_m is None:
-                    self._without_depth.add(row)
+            if self.options.humminbird_depth_as_altitude and ping.altitude_m is None:
+                notes.pings.add(_NO_DEPTH, row)
             yield ping
 
     def _parts(self, side: Side, file: CheckedFile, notes: Notes) -> Iterator[PingPart[dict[int, int]]]:

@@ -32,7 +32,7 @@ import numpy as np
 from typing_extensions import override
 
 from sonarpost.sonar.geometry import Position
-from sonarpost.sonar.navigation import KNOT_MPS, PingCounter, is_plausible, position_in_degrees
+from sonarpost.sonar.navigation import KNOT_MPS, is_plausible, position_in_degrees
 from sonarpost.sonar.projection import Projection, grid_coordinates
 from sonarpost.sonar.readers.file_source import FileSource
 from sonarpost.sonar.readers.joining import PingPart, joined
@@ -67,6 +67,7 @@ _SOUND_SPEEDS_MPS: Final = (1300.0, 1700.0)
 _MAX_WEIGHT: Final = 31
 _MAX_LEAD: Final = 4
 """Maximum number of samples before the first recorded one, as a multiple of the recorded ones."""
+_FIX_OF_ANTENNA: Final = "position of the antenna at the last fix, without layback (option mounting),"
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _START: Final = re.compile(rb"\x01\x16(?=[\x01-\x3f]..[\x00-\x4e].{9}[\x00\x01])", re.DOTALL)
 """Marker, and possible protocol, type and size."""
@@ -116,25 +117,18 @@ class JsfSource(FileSource):
     def _prepare(self) -> None:
         crs = self.options.projected_crs
         self._projection = None if crs is None else Projection(crs)
-        self._fix_of_antenna = PingCounter()
 
     @override
     def _format_warnings(self) -> list[str]:
-        warnings = super()._format_warnings()
-        if self._fix_of_antenna.count:
-            warnings.append(
-                "position of the antenna at the last fix, without layback (option mounting), in "
-                + self._fix_of_antenna.summary(self._pings)
-            )
-        return warnings
+        return [*super()._format_warnings(), *self._notes.pings.lines(self._pings, [_FIX_OF_ANTENNA])]
 
     @override
-    def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
+    def _stored_pings(self, notes: Notes) -> Iterator[Ping]:
         for row, part in enumerate(joined(self._parts(notes), max_gap_s=_SAME_PING_S, held_pings=_HELD_PINGS)):
             ping = self._ping(part)
             is_antenna = ping.layback_m is None and not _is_valid(part.head[1], _INTERPOLATED)
-            if first_pass and is_antenna and ping.lat_deg is not None:
-                self._fix_of_antenna.add(row)
+            if is_antenna and ping.lat_deg is not None:
+                notes.pings.add(_FIX_OF_ANTENNA, row)
             yield ping
 
     def _parts(self, notes: Notes) -> Iterator[PingPart[_Head]]:

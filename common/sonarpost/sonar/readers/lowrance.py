@@ -177,7 +177,7 @@ class LowranceSource(FileSource):
         return float(dates.most_common(1)[0][0]) if dates else 0.0
 
     @override
-    def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
+    def _stored_pings(self, notes: Notes) -> Iterator[Ping]:
         for place, _, raw in records(self._file, self._frames, _FILE_HEADER_BYTES, notes):
             _, channel, samples = self._frames.sizes(raw)
             if channel == _COMPOSITE:

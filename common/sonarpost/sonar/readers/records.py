@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from typing import Final
 
 from sonarpost.errors import SurveyFileError
+from sonarpost.sonar.navigation import PingNotes
 from sonarpost.sonar.readers.open_file import CheckedFile, SequentialReader
 
 _SEARCH_BYTES: Final = 1 << 18
@@ -73,6 +74,8 @@ class Notes:
         self._damaged_places = 0
         self._ends: list[str] = []
         self.first_error: SurveyFileError | None = None
+        self.pings = PingNotes()
+        """Irregularities of single pings, which `warnings` does not include."""
 
     def add(self, text: str, count: int = 1) -> None:
         """Count an irregularity."""

@@ -109,7 +109,7 @@ class SdfSource(FileSource):
     SONAR = "Klein"
 
     @override
-    def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
+    def _stored_pings(self, notes: Notes) -> Iterator[Ping]:
         for part in joined(self._parts(notes), max_gap_s=_SAME_PING_S, held_pings=_HELD_PINGS):
             yield _ping(part)
 

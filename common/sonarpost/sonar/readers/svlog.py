@@ -105,11 +105,11 @@ class SvlogSource(FileSource):
         return warnings
 
     @override
-    def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
+    def _stored_pings(self, notes: Notes) -> Iterator[Ping]:
         timeline = Timeline(self._file, notes)
         for _, segment in groupby(self._profiles(notes), key=lambda profile: profile.segment):
             for ping in timeline.pings(segment):
-                if first_pass:
+                if notes is self._notes:  # the first pass
                     self._transducers.update((channel.side, channel.index) for channel in ping.channels)
                     self._one_sided += len({channel.side for channel in ping.channels}) == 1
                 yield ping

@@ -35,13 +35,14 @@ from sonarpost.sonar.image_files import read_image
 from sonarpost.sonar.navigation import (
     KNOT_MPS,
     NAVIGATION_LIMITS,
-    PingCounter,
+    PingNotes,
     is_plausible,
+    out_of_range,
     position_in_degrees,
 )
 from sonarpost.sonar.options import ProjectedCrs
 from sonarpost.sonar.projection import Projection, grid_coordinates
-from sonarpost.sonar.readers.file_source import FileSource
+from sonarpost.sonar.readers.file_source import NO_FIX, FileSource
 from sonarpost.sonar.readers.open_file import CheckedFile
 from sonarpost.sonar.readers.records import Notes
 from sonarpost.sonar.survey import MAX_SLANT_RANGE_M, ChannelPing, Ping, Side
@@ -103,7 +104,6 @@ class WaterfallSource(FileSource):
             )
         self._projection = Projection(crs) if crs is not None and self._config.positions == "metres" else None
         self._images = self._read_images()
-        self._implausible: dict[str, PingCounter] = {}
         return (self.path.parent / self._config.navigation,)
 
     @override
@@ -135,19 +135,15 @@ class WaterfallSource(FileSource):
 
     @override
     def _format_warnings(self) -> list[str]:
-        missing = [f"no position fix in {self._without_fix.summary(self._pings)}"] if self._without_fix.count else []
-        return missing + [
-            f"{name} out of range in {counter.summary(self._pings)}"
-            for name, counter in sorted(self._implausible.items())
-        ]
+        return self._notes.pings.lines(self._pings, [NO_FIX, *map(out_of_range, sorted(NAVIGATION_LIMITS))])
 
     @override
-    def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
+    def _stored_pings(self, notes: Notes) -> Iterator[Ping]:
         count = -1
         for count, values in enumerate(self._lines()):
             if any(count >= image.shape[0] for image in self._images.values()):
                 break
-            yield self._ping(count, values, first_pass=first_pass)
+            yield self._ping(count, values, notes.pings)
         for side, image in self._images.items():
             if image.shape[0] != count + 1:
                 expected = f"a table of {image.shape[0]} lines, as the {side.value} image has rows"
@@ -182,13 +178,13 @@ class WaterfallSource(FileSource):
                 raise self._file.error("header", f"no {name!r}", "a column of that name, or one in columns")
         return indices
 
-    def _ping(self, row: int, values: dict[str, str], *, first_pass: bool) -> Ping:
+    def _ping(self, row: int, values: dict[str, str], notes: PingNotes) -> Ping:
         slant_range_m = self._number(row, "slant_range_m", values)
         if slant_range_m is None or not 0 < slant_range_m <= MAX_SLANT_RANGE_M:
             raise self._file.error(
                 f"ping {row}, slant_range_m", values["slant_range_m"], f"metres, above 0 to {MAX_SLANT_RANGE_M:.0f}"
             )
-        navigation = {name: self._plausible(row, name, values, first_pass=first_pass) for name in NAVIGATION_LIMITS}
+        navigation = {name: self._plausible(row, name, values, notes) for name in NAVIGATION_LIMITS}
         if navigation["heading_deg"] == 360.0:
             navigation["heading_deg"] = 0.0
         position = self._position(row, values)
@@ -223,7 +219,7 @@ class WaterfallSource(FileSource):
             raise self._file.error(f"ping {row}, {name}", text, "a number or an empty field") from error
         return value if math.isfinite(value) else None
 
-    def _plausible(self, row: int, name: str, values: dict[str, str], *, first_pass: bool) -> float | None:
+    def _plausible(self, row: int, name: str, values: dict[str, str], notes: PingNotes) -> float | None:
         value = self._number(row, name, values)
         if value is None or (value == 0 and (self._config.zero_is_unknown or name == "altitude_m")):
             return None
@@ -231,8 +227,7 @@ class WaterfallSource(FileSource):
             value *= KNOT_MPS
         if is_plausible(name, value):
             return value
-        if first_pass:
-            self._implausible.setdefault(name, PingCounter()).add(row)
+        notes.add(out_of_range(name), row)
         return None
 
     def _coordinates(self, row: int, values: dict[str, str]) -> tuple[float, float] | None:

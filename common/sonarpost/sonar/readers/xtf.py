@@ -76,17 +76,17 @@ class XtfSource(FileSource):
 
     @override
     def _format_warnings(self) -> list[str]:
-        navigation = self._navigation.warnings(self._pings)
+        navigation = self._navigation.warnings(self._notes.pings, self._pings)
         return [*super()._format_warnings(), *navigation, *self._port_order.warnings()]
 
     @override
-    def _stored_pings(self, notes: Notes, *, first_pass: bool) -> Iterator[Ping]:
+    def _stored_pings(self, notes: Notes) -> Iterator[Ping]:
         by_number = self._numbering.repeats_pings
         pings = joined(self._parts(notes), max_gap_s=_MAX_GAP_S, by_number=by_number, held_pings=_HELD_PINGS)
         for row, part in enumerate(pings):
-            if first_pass:
+            if notes is self._notes:  # the first pass
                 self._port_order.observe(part.channels)
-            yield self._navigation.ping(part, row if first_pass else None)
+            yield self._navigation.ping(part, row, notes.pings)
 
     def _parts(self, notes: Notes) -> Iterator[PingPart[PingHead]]:
         """Yield the side-scan channels of each sonar packet."""

@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 from pyxtf import XTFPingHeader
 
 from sonarpost.sonar.geometry import Position, offset_between_m
-from sonarpost.sonar.navigation import KNOT_MPS, PingCounter, is_plausible, position_in_degrees
+from sonarpost.sonar.navigation import KNOT_MPS, PingNotes, is_plausible, out_of_range, position_in_degrees
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection, grid_coordinates
 from sonarpost.sonar.readers.joining import PingPart
@@ -71,7 +71,6 @@ class Navigation:
         self._from_attitude: list[str] = []
         self._source = "sensor"
         self._layback_use: Literal["", "apply", "note"] = ""
-        self._implausible: dict[str, PingCounter] = {}
 
     def scan(self, head: XTFPingHeader) -> None:
         """Count the fields of a ping that are not zero."""
@@ -110,17 +109,16 @@ class Navigation:
         elif counts["calculated"] < counts["towed"] / 2:  # a calculated position comes close to the ship in a turn
             self._layback_use = "note"
 
-    def ping(self, part: PingPart[PingHead], row: int | None) -> Ping:
-        """Return a ping with its navigation; in the first pass `row` is given, and irregularities are counted."""
+    def ping(self, part: PingPart[PingHead], row: int, notes: PingNotes) -> Ping:
+        """Return a ping with its navigation, and note values that are out of range."""
         head, attitude = part.head
         x, y = _coordinates(head, self._source)
         place = self._place(x, y)
         grid_m = place if isinstance(place, tuple) else None
         stored = {name: float(getattr(head, field)) * unit for name, (field, unit) in _FIELDS.items()}
-        if row is not None:
-            for name, value in stored.items():
-                if value and not is_plausible(name, value):
-                    self._implausible.setdefault(name, PingCounter()).add(row)
+        for name, value in stored.items():
+            if value and not is_plausible(name, value):
+                notes.add(out_of_range(name), row)
         known = self._recorded if x or y or any(stored.values()) else set()  # the recorder had no navigation yet
         values: dict[str, Any] = {
             name: value if name in known and is_plausible(name, value) else None for name, value in stored.items()
@@ -148,8 +146,8 @@ class Navigation:
             **values,
         )
 
-    def warnings(self, total: int) -> list[str]:
-        """Return one line for each kind of irregularity in `total` pings."""
+    def warnings(self, notes: PingNotes, total: int) -> list[str]:
+        """Return one line for each kind of irregularity in `total` pings, with those of `notes`."""
         lines = []
         if self._from_attitude:
             names, packets = ", ".join(self._from_attitude), self._attitude_counts["packets"]
@@ -169,8 +167,7 @@ class Navigation:
         if self._nav_units not in (NAV_UNITS_DEGREES, NAV_UNITS_METRES):
             expected = f"{NAV_UNITS_DEGREES} (degrees) or {NAV_UNITS_METRES} (projected metres)"
             lines.append(f"no positions: NavUnits is {self._nav_units}, expected {expected}")
-        implausible = sorted(self._implausible.items())
-        return lines + [f"{name} out of range in {counter.summary(total)}" for name, counter in implausible]
+        return lines + notes.lines(total, map(out_of_range, sorted(_FIELDS)))
 
     def _note(self, layback_m: float) -> str:
         reason = "the sensor's position is the ship's"
