@@ -26,6 +26,7 @@ import numpy as np
 from research.common.command import command_parser, run_command
 from research.common.statistics import auc
 from research.detection.simulated import evaluate_file, pd_at, roc
+from research.training.detection.calibrate import with_calibration, write_classifier
 from research.training.detection.examples import Examples
 from sonarpost.detection.candidates import candidate_peaks
 from sonarpost.detection.chips import ChipCutter
@@ -35,7 +36,6 @@ from sonarpost.detection.classifier import (
     Classifier,
     default_classifier,
     load_classifier,
-    write_classifier,
 )
 from sonarpost.detection.images import ScaledImage, detect_in_image, normalise_window, seabed_window
 from sonarpost.detection.matched_filter import matched_response
@@ -199,7 +199,7 @@ def new_classifier(start: Classifier, examples: Examples, steps: int, seed: int)
         raise ConfigError("finetune", "PyTorch", str(error), "the package torch") from error
     trained: Classifier = module.train(examples, steps, seed, start, LEARNING_RATE)
     slope, *offsets = start.weights["calibration"].tolist()
-    return trained.with_calibration(slope, (offsets[0], offsets[1], offsets[2]))
+    return with_calibration(trained, slope, (offsets[0], offsets[1], offsets[2]))
 
 
 def new_parser() -> argparse.ArgumentParser:
@@ -235,8 +235,7 @@ def run(arguments: argparse.Namespace) -> int:
     result = new_classifier(start, examples, arguments.steps, arguments.seed)
     old_path = arguments.out.with_suffix(".old.npz")
     for path, classifier in ((old_path, start), (arguments.out, result)):
-        with path.open("wb") as file:
-            write_classifier(classifier, file)
+        write_classifier(classifier, path)
     for name, path in (("present", old_path), ("new", arguments.out)):
         figures = compared(path, test_part, arguments.files)
         identity = load_classifier(path).identity

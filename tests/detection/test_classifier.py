@@ -15,7 +15,6 @@ from sonarpost.detection.classifier import (
     load_classifier,
     load_classifier_once,
     weight_shapes,
-    write_classifier,
 )
 from sonarpost.detection.detector import classifier_of
 from sonarpost.detection.settings import DetectorSettings
@@ -83,15 +82,15 @@ def test_result_depends_neither_on_the_batch_nor_on_the_direction_of_travel():
 
 def test_calibration_changes_probabilities_by_slope_and_offset():
     outputs = np.array([[0.0, 1.0, 2.0]], dtype=np.float32)
-    classifier = Classifier(random_weights()).with_calibration(2.0, (0.0, 0.0, -4.0))
+    calibration = np.array([2.0, 0.0, 0.0, -4.0], np.float32)
+    classifier = Classifier({**random_weights(), "calibration": calibration})
     odds = np.exp([0.0, 2.0, 0.0])
     np.testing.assert_allclose(classifier.calibrated(outputs)[0], odds / odds.sum(), rtol=1e-5)
 
 
 def test_file_has_the_same_identity_after_writing_again(tmp_path):
     path = tmp_path / "weights.npz"
-    with path.open("wb") as file:
-        write_classifier(default_classifier(), file)
+    np.savez_compressed(path, **default_classifier().weights)
     identity = default_classifier().identity
     assert load_classifier(path).identity == load_classifier(path, identity).identity == identity
     assert Classifier(random_weights(1)).identity != Classifier(random_weights(2)).identity

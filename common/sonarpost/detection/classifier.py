@@ -93,10 +93,6 @@ class Classifier:
             digest.update(f"{name}{array.shape}".encode() + array.astype("<f4").tobytes())
         return digest.hexdigest()[:16]
 
-    def with_calibration(self, slope: float, offsets: tuple[float, float, float]) -> Classifier:
-        """Return the same network with another calibration."""
-        return Classifier({**self.weights, "calibration": np.array([slope, *offsets], dtype=np.float32)})
-
     def outputs(self, chips: ChipBatch) -> Array:
         """Return the outputs before calibration, mean of each chip and its mirror image, shape (chips, 3)."""
         return np.asarray((self._network(chips) + self._network(chips.mirrored())) * np.float32(0.5))
@@ -200,8 +196,3 @@ def _parsed(file: IO[bytes], where: str) -> Classifier:
             return Classifier({name: np.asarray(table[name]) for name in table.files})
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
         raise ConfigError(where, "weights", str(error), expected) from error
-
-
-def write_classifier(classifier: Classifier, file: IO[bytes]) -> None:
-    """Write a classifier as npz."""
-    np.savez_compressed(file, **{name: classifier.weights[name] for name in weight_shapes()})  # type: ignore[arg-type]

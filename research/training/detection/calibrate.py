@@ -26,7 +26,7 @@ from sonarpost.detection.classifier import (
     SEABED,
     Classifier,
     load_classifier,
-    write_classifier,
+    weight_shapes,
 )
 from sonarpost.detection.matched_filter import matched_response
 from sonarpost.detection.normalisation import normalise_side
@@ -94,7 +94,7 @@ def calibrated(classifier: Classifier, files: int, workers: int) -> Classifier:
     """
     slope, offsets = 1.0, (0.0, 0.0, 0.0)
     for _ in range(_ROUNDS):
-        present = classifier.with_calibration(slope, offsets)
+        present = with_calibration(classifier, slope, offsets)
         work = [(present, kind, FIRST_SEED + n) for n in range(files) for kind in SeabedKind]
         parts = []
         with ProgressDisplay() as progress, multiprocessing.Pool(workers) as pool:
@@ -105,7 +105,18 @@ def calibrated(classifier: Classifier, files: int, workers: int) -> Classifier:
         factor, more = fitted_calibration(outputs, labels)
         slope = factor * slope
         offsets = (0.0, factor * offsets[1] + more[1], factor * offsets[2] + more[2])
-    return classifier.with_calibration(slope, offsets)
+    return with_calibration(classifier, slope, offsets)
+
+
+def with_calibration(classifier: Classifier, slope: float, offsets: tuple[float, float, float]) -> Classifier:
+    """Return the same network with another calibration."""
+    return Classifier({**classifier.weights, "calibration": np.array([slope, *offsets], dtype=np.float32)})
+
+
+def write_classifier(classifier: Classifier, path: Path) -> None:
+    """Write a classifier as npz."""
+    with path.open("wb") as file:  # `savez_compressed` would append a suffix to a path
+        np.savez_compressed(file, **{name: classifier.weights[name] for name in weight_shapes()})  # type: ignore[arg-type]
 
 
 def main() -> None:
@@ -117,8 +128,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
     classifier = calibrated(load_classifier(arguments.network), arguments.files, arguments.workers)
-    with arguments.out.open("wb") as file:
-        write_classifier(classifier, file)
+    write_classifier(classifier, arguments.out)
     print(f"{arguments.out}: identity {classifier.identity}, calibration {classifier.weights['calibration'].tolist()}")
 
 

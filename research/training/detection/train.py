@@ -19,6 +19,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from research.training.detection.calibrate import write_classifier
 from research.training.detection.examples import Examples
 from sonarpost.detection.chips import COARSE_CENTRE, COARSE_STEP, FINE_CENTRE
 from sonarpost.detection.classifier import (
@@ -28,7 +29,6 @@ from sonarpost.detection.classifier import (
     Classifier,
     load_classifier,
     weight_shapes,
-    write_classifier,
 )
 
 STEPS: Final = 14_000
@@ -196,8 +196,7 @@ def main() -> None:
     start = None if arguments.start is None else load_classifier(arguments.start)
     examples = Examples.joined([Examples.load(path) for path in arguments.examples])
     classifier = train(examples, arguments.steps, arguments.seed, start)
-    with arguments.out.open("wb") as file:
-        write_classifier(classifier, file)
+    write_classifier(classifier, arguments.out)
     print(f"{arguments.out}: identity {classifier.identity}")
 
 

@@ -14,7 +14,7 @@ from builders.xtf import write_xtf
 from PIL import Image
 
 from sonarpost.config import load
-from sonarpost.detection.classifier import default_classifier, write_classifier
+from sonarpost.detection.classifier import default_classifier
 from sonarpost.detection.detector import FilterScores, detect
 from sonarpost.detection.settings import DetectorSettings, DetectorTuning, load_settings
 from sonarpost.detection.snippets import ground_projected_image
@@ -139,8 +139,7 @@ def test_settings_of_the_detector_are_configured(tmp_path):
 
 def test_another_classifier_than_configured_stops_the_start(start_service, tmp_path):
     path = tmp_path / "classifier.npz"
-    with path.open("wb") as file:
-        write_classifier(default_classifier(), file)
+    np.savez_compressed(path, **default_classifier().weights)
     tuning = DetectorTuning(classifier=str(path), classifier_identity="0" * 16)
     with pytest.raises(ConfigError, match="identity: got"):
         start_service(detector=tuning)
