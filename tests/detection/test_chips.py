@@ -25,7 +25,7 @@ def grid_of(level, *, altitude_cells=0, cell_m=0.06, row_m=0.1):
     level = np.array(level, dtype=np.float32)
     level[:, :altitude_cells] = np.nan
     first = np.full(len(level), altitude_cells, dtype=np.int64)
-    return LevelGrid(Side.PORT, level, first, first, 2, cell_m, row_m, row_is_measured=True)
+    return LevelGrid(Side.PORT, level, first, 2, cell_m, row_m, row_is_measured=True)
 
 
 def square_on_the_seabed(altitude_m, cell_m, row_m, ground_m=12.0, along_m=10.0, side_m=1.0):

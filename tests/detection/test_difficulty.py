@@ -1,6 +1,5 @@
 """Difficulty of the seabed: features on synthetic grids, the model of the expected Pd, search, strips and files."""
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -15,16 +14,15 @@ from sonarpost.detection.detector import search
 from sonarpost.detection.difficulty import (
     RELIABLE_PD,
     Difficulty,
+    PdModel,
     combined,
     default_pd_model,
-    load_pd_model,
     seabed_difficulty,
     unreliable_text,
 )
 from sonarpost.detection.normalisation import LevelGrid
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.stream import FileOrigin, StreamDetector
-from sonarpost.errors import ConfigError
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.source import InMemorySource
 from sonarpost.sonar.survey import Side
@@ -33,13 +31,11 @@ pytestmark = pytest.mark.usefixtures("few_candidates")
 
 ROW_M, CELL_M = 0.1, 0.06
 ROWS, CELLS = 500, 450
-MODEL = {"thresholds": [0.1, 1.9], "offsets": [8.0, 4.0]}
-MODEL |= {"clutter_weight": 1.0, "contrast_weight": 2.0, "ripple_weight": 1.0}
 
 
 def grid_of(level, row_m=ROW_M, cell_m=CELL_M):
     rows = np.zeros(len(level), dtype=np.int64)
-    return LevelGrid(Side.PORT, level.astype(np.float32), rows, rows, 1, cell_m, row_m, row_is_measured=True)
+    return LevelGrid(Side.PORT, level.astype(np.float32), rows, 1, cell_m, row_m, row_is_measured=True)
 
 
 def places(row_m=ROW_M, cell_m=CELL_M, shape=(ROWS, CELLS)):
@@ -134,36 +130,9 @@ def test_model_separates_sand_from_rock_and_extreme_odds_do_not_overflow():
     assert sand > 0.8
     assert rock < sand - 0.2
     assert model.expected_pd(50.0, 0.14, 1.2, 0.1) > model.expected_pd(50.0, 0.14, 1.2, 1.9)
-    model = load_pd_model(json.dumps(MODEL | {"offsets": [1000.0, -1000.0], "clutter_weight": 1000.0}), "x")
+    weights = {"clutter_weight": 1000.0, "contrast_weight": 2.0, "ripple_weight": 1.0}
+    model = PdModel(thresholds=[0.1, 1.9], offsets=[1000.0, -1000.0], **weights)
     assert (model.expected_pd(0.0, 0.0, 0.0, 0.0), model.expected_pd(1e9, 1.0, 9.0, 2.0)) == (1.0, 0.0)
-
-
-@pytest.mark.parametrize(
-    ("change", "field", "expected"),
-    [
-        ({"clutter_weight": -1.0}, "clutter_weight", "greater than or equal to 0"),
-        ({"ripple_weight": "1"}, "ripple_weight", "a valid number"),
-        ({"contrast_weight": None}, "contrast_weight", "a valid number"),
-        ({"thresholds": [0.1, 2.5]}, "thresholds.1", "less than or equal to 2"),
-        ({"thresholds": [1.0, 1.0]}, "", "increasing thresholds"),
-        ({"offsets": [1.0]}, "", "as many offsets as thresholds"),
-        ({"offsets": [1.0, 2.0]}, "", "offsets that do not increase"),
-        ({"offsets": []}, "offsets", "at least 1 item"),
-    ],
-)
-def test_error_names_the_invalid_field(change, field, expected):
-    with pytest.raises(ConfigError) as error:
-        load_pd_model(json.dumps(MODEL | change), "table.json")
-    text = str(error.value)
-    assert text.startswith(f"table.json: {field}: got " if field else "table.json: got ")
-    assert expected in text
-
-
-def test_invalid_tables_are_refused():
-    numbers = [json.dumps(MODEL).replace("8.0", number).encode() for number in ("NaN", "1e999")]
-    for text in (b"", b"[]", b"null", b"{", b"\xff\xfe", b"{}", b"[" * 5000, *numbers):
-        with pytest.raises(ConfigError, match=r"^table.json: .*got .*, expected "):
-            load_pd_model(text, "table.json")
 
 
 def test_combined_is_weighted_by_area():

@@ -16,11 +16,11 @@ from sonarpost.cli.detection.options import read_transmissions
 from sonarpost.cli.main import main
 from sonarpost.detection.detector import detect
 from sonarpost.detection.stream import FileOrigin, StreamDetector
-from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals, masked_pings
+from sonarpost.detection.transmissions import MaskedSource, TransmitIntervals
 from sonarpost.errors import ConfigError
 from sonarpost.sonar.options import SurveyOptions
-from sonarpost.sonar.source import InMemorySource
-from sonarpost.sonar.survey import ChannelPing, Ping, Side
+from sonarpost.sonar.source import InMemorySource, load_survey
+from sonarpost.sonar.survey import ChannelPing, Ping, Side, Survey
 
 pytestmark = pytest.mark.usefixtures("few_candidates")
 
@@ -60,7 +60,8 @@ def transmissions(bursts=BURSTS):
 
 
 def masked(survey, intervals):
-    return replace(survey, pings=tuple(masked_pings(survey.pings, intervals)))
+    source = InMemorySource(survey, SurveyOptions(heading_source="sensor"))
+    return load_survey(MaskedSource(source, intervals))
 
 
 def test_margins_and_listening_time_belong_to_a_transmission():
@@ -106,7 +107,8 @@ def test_invalid_intervals_and_margins_are_one_error():
 
 def test_a_masked_ping_keeps_its_navigation():
     quiet, loud = ping_at(90.0), ping_at(101.0)
-    first, second = masked_pings([quiet, loud], TransmitIntervals.of([(100.0, 105.0)]))
+    survey = Survey(Path("a.xtf"), "x", "a", (quiet, loud))
+    first, second = masked(survey, TransmitIntervals.of([(100.0, 105.0)]))
     assert first is quiet
     assert second == replace(loud, channels=())
 

@@ -10,7 +10,7 @@ from research.detection import difficulty as command
 from research.detection.difficulty import FIRST_TRAINING_SEED, THRESHOLDS, Mine, calibration, fitted, mines_of_file
 from research.detection.simulated import FIRST_SEED
 from sonarpost.detection import difficulty as shipped
-from sonarpost.detection.difficulty import Difficulty, PdModel, load_pd_model
+from sonarpost.detection.difficulty import Difficulty, PdModel
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 
 WEIGHTS = {"clutter_weight": 0.8, "contrast_weight": 2.5, "ripple_weight": 0.0}
@@ -92,5 +92,5 @@ def test_command_writes_a_model_and_prints_the_calibration(monkeypatch, tmp_path
     assert "predicted Pd" in output
     written = json.loads(path.read_text("utf-8"))
     assert written["seeds"] == [FIRST_TRAINING_SEED, FIRST_TRAINING_SEED + 1]
-    load_pd_model(path.read_bytes(), str(path))
+    PdModel.model_validate_json(path.read_bytes(), strict=True)
     assert set(shipped.PdModel.model_fields) < set(written)

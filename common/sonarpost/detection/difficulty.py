@@ -19,17 +19,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from itertools import pairwise
-from typing import Annotated, Final, Self
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel
 from scipy import ndimage
 
 from sonarpost.detection.normalisation import LevelGrid
-from sonarpost.errors import ConfigError
-from sonarpost.wire import first_error
 
 RELIABLE_PD: Final = 0.8
 """Below this expected Pd a result without contacts does not mean that there are no mines."""
@@ -46,9 +43,6 @@ _MIN_KNOWN: Final = 0.9
 _RIPPLE_WAVELENGTH_M: Final = (0.4, 2.0)
 
 _Blocks = npt.NDArray[np.float64]
-_Weight = Annotated[float, Field(ge=0, le=1000)]
-_Threshold = Annotated[float, Field(ge=0, le=2)]
-_Offset = Annotated[float, Field(ge=-1000, le=1000)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,30 +75,18 @@ class PdModel(BaseModel):
 
     Attributes:
         thresholds: Confidence thresholds of `offsets`, increasing, 0 to 2.
-        offsets: Log odds on a seabed without clutter, ripples and contrast; not increasing. Between two thresholds
-            they are interpolated, beyond the first and the last they are constant.
+        offsets: Log odds on a seabed without clutter, ripples and contrast, one for each threshold; not increasing.
+            Between two thresholds they are interpolated, beyond the first and the last they are constant.
         clutter_weight: Weight of ln(1 + clutter echoes per 1000 m²), 0 or more.
         contrast_weight: Weight of the contrast, 0 or more.
         ripple_weight: Weight of the ripple strength, 0 or more.
     """
 
-    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
-
-    thresholds: Annotated[list[_Threshold], Field(min_length=1, max_length=100)]
-    offsets: Annotated[list[_Offset], Field(min_length=1, max_length=100)]
-    clutter_weight: _Weight
-    contrast_weight: _Weight
-    ripple_weight: _Weight
-
-    @model_validator(mode="after")
-    def _is_monotone(self) -> Self:
-        if len(self.offsets) != len(self.thresholds):
-            raise ValueError("as many offsets as thresholds")
-        if not all(low < high for low, high in pairwise(self.thresholds)):
-            raise ValueError("increasing thresholds")
-        if not all(high >= low for high, low in pairwise(self.offsets)):
-            raise ValueError("offsets that do not increase")
-        return self
+    thresholds: list[float]
+    offsets: list[float]
+    clutter_weight: float
+    contrast_weight: float
+    ripple_weight: float
 
     def expected_pd(
         self, clutter_per_1000_m2: float, ripple_strength: float, contrast: float, threshold: float
@@ -123,28 +105,13 @@ class PdModel(BaseModel):
         return 1.0 / (1.0 + math.exp(-odds)) if odds > 0 else math.exp(odds) / (1.0 + math.exp(odds))
 
 
-def load_pd_model(text: str | bytes, where: str) -> PdModel:
-    """Return the model of a JSON object with the fields of `PdModel`; other fields are ignored.
-
-    Raises:
-        ConfigError: The text is not such an object; names `where`.
-    """
-    try:
-        return PdModel.model_validate_json(text, strict=True)
-    except ValidationError as error:
-        raise ConfigError(where, *first_error(error)) from error
-
-
 @cache
 def default_pd_model() -> PdModel:
     """Return the model of `difficulty.json`."""
-    name = "difficulty.json"
-    return load_pd_model(files("sonarpost.detection").joinpath(name).read_bytes(), name)
+    return PdModel.model_validate_json(files("sonarpost.detection").joinpath("difficulty.json").read_bytes())
 
 
-def seabed_difficulty(
-    grid: LevelGrid, matched: Sequence[float], threshold: float, model: PdModel | None = None
-) -> Difficulty | None:
+def seabed_difficulty(grid: LevelGrid, matched: Sequence[float], threshold: float) -> Difficulty | None:
     """Return the difficulty of one side of a strip.
 
     Args:
@@ -152,7 +119,6 @@ def seabed_difficulty(
         matched: Response of the matched filter at its local maxima there, in local noise units. Those below
             `CLUTTER_RESPONSE` may be absent.
         threshold: Confidence threshold of the search, 0 to 2.
-        model: None for the default model.
 
     Returns:
         None if less than 100 m² of seabed is known, or no tile of 6.4 m for the ripple strength.
@@ -167,8 +133,8 @@ def seabed_difficulty(
         return None
     clutter = 1000.0 * sum(score >= CLUTTER_RESPONSE for score in matched) / area_m2
     contrast = float(np.nanstd(blocks))
-    model = model if model is not None else default_pd_model()
-    return Difficulty(area_m2, clutter, ripples, contrast, model.expected_pd(clutter, ripples, contrast, threshold))
+    expected_pd = default_pd_model().expected_pd(clutter, ripples, contrast, threshold)
+    return Difficulty(area_m2, clutter, ripples, contrast, expected_pd)
 
 
 def combined(difficulties: Iterable[Difficulty | None]) -> Difficulty | None:

@@ -200,7 +200,7 @@ def normalise_window(window: SeabedWindow, side: Side) -> LevelGrid | None:
     floor = 0.02 * float(np.nanmedian(seabed))
     ratio = ((cells + floor) / (seabed + floor)).astype(np.float32)
     none = np.zeros(cells.shape[0], dtype=np.int64)
-    return LevelGrid(side, levels_of_ratio(ratio), none, none, columns, cell_m, row_m, row_is_measured=True)
+    return LevelGrid(side, levels_of_ratio(ratio), none, columns, cell_m, row_m, row_is_measured=True)
 
 
 def _block_means(values: FloatImage, rows: int, columns: int) -> FloatImage:

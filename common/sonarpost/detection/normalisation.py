@@ -42,7 +42,6 @@ class LevelGrid:
         side: Port or starboard.
         level: Shape (pings, cells), float32, base-2 logarithm of echo over local median; NaN in the water column,
             beyond the end of a ping, and in a ping without this channel. Column 0 is nearest the vehicle.
-        bottom_cell: Shape (pings,), the first seabed cell (the number of cells if there is none).
         first_return_cell: Shape (pings,), the cell of the first bottom return, where slant range equals altitude.
         samples_per_cell: Number of file samples averaged into one cell.
         cell_across_m: Slant range of one cell.
@@ -55,7 +54,6 @@ class LevelGrid:
 
     side: Side
     level: FloatImage
-    bottom_cell: IntVector
     first_return_cell: IntVector
     samples_per_cell: int
     cell_across_m: float
@@ -112,7 +110,6 @@ def normalise_side(
     return LevelGrid(
         side=side,
         level=levels_of_ratio(ratio),
-        bottom_cell=bottom,
         first_return_cell=first_return,
         samples_per_cell=samples_per_cell,
         cell_across_m=cell_m,

@@ -343,7 +343,6 @@ class _StripPicks:
         grid = LevelGrid(
             side=pick.side,
             level=np.broadcast_to(np.float32(np.nan), (pings, len(channel.samples))),
-            bottom_cell=np.zeros(pings, dtype=np.int64),
             first_return_cell=np.zeros(pings, dtype=np.int64),
             samples_per_cell=1,
             cell_across_m=channel.sample_spacing_m,
