@@ -78,19 +78,8 @@ class TransmitIntervals:
         return last >= 0 and self.ends_utc_s[last] >= ping.time_utc_s
 
 
-def masked_pings(pings: Iterable[Ping], intervals: TransmitIntervals) -> Iterator[Ping]:
-    """Yield the pings; those that a transmission disturbs are without channels, with their navigation."""
-    for _, masked in _with_mask(pings, intervals):
-        yield masked
-
-
-def _with_mask(pings: Iterable[Ping], intervals: TransmitIntervals) -> Iterator[tuple[Ping, Ping]]:
-    for ping in pings:
-        yield ping, replace(ping, channels=()) if intervals.contains(ping) else ping
-
-
 class MaskedSource(SurveySource):
-    """An open recording whose disturbed pings have no channels.
+    """An open recording whose disturbed pings have no channels, with their navigation.
 
     Args:
         source: The recording; its owner closes it.
@@ -112,11 +101,12 @@ class MaskedSource(SurveySource):
     @override
     def pings(self) -> Iterator[Ping]:
         self.masked_count = 0
-        for ping, masked in _with_mask(self._source.pings(), self._intervals):
-            self.masked_count += masked is not ping
+        for ping in self._source.pings():
+            is_masked = self._intervals.contains(ping)
+            self.masked_count += is_masked
             if ping.lat_deg is not None and ping.lon_deg is not None:
                 self.newest = ping
-            yield masked
+            yield replace(ping, channels=()) if is_masked else ping
 
     @property
     def masked_share(self) -> float:

@@ -22,30 +22,26 @@ _RISE: Final = 0.5
 """Threshold of the first return between the levels of water and bottom, as a fraction in decibels."""
 _MIN_CONTRAST: Final = 1.8
 _SMOOTHING_PINGS: Final = 5
+_MEDIAN_PINGS: Final = 31
+"""Window of the median over the estimates; also the longest gap that is interpolated."""
 _STEP_BINS: Final = 10
 _MIN_STEP: Final = math.log(1.3)
 
 
-def track_bottom(survey: Survey, *, window_pings: int = 31) -> FloatArray:
+def track_bottom(survey: Survey) -> FloatArray:
     """Estimate the altitude of every ping from the first sustained rise of the echo strength.
 
     Both sides are averaged by slant range: a rise on one side only is an object. The estimate is the first place after
     the ringing of the transmission where the echo rises above the level of the water and stays there. If the recorder
     compresses the echo, water and far bottom differ little; an earlier and sharper step is then used. A median over
-    `window_pings` smooths the estimates.
+    31 pings smooths the estimates.
 
     Args:
         survey: Pings with any number of samples and any range.
-        window_pings: Window of the median, odd. Also the longest gap that is interpolated.
 
     Returns:
         Altitude in metres, shape (pings,), float64; NaN without a clear rise.
-
-    Raises:
-        ValueError: `window_pings` is even or not positive.
     """
-    if window_pings < 1 or window_pings % 2 == 0:
-        raise ValueError(f"window_pings is {window_pings}, expected an odd number above 0")
     range_m = max(survey.max_slant_range_m(side) for side in Side)
     skip = round(_RING_DOWN_M / range_m * _BINS) if range_m > 0 else _BINS
     if skip >= _BINS:  # nothing follows the ringing
@@ -54,7 +50,7 @@ def track_bottom(survey: Survey, *, window_pings: int = 31) -> FloatArray:
     echo = uniform_filter(echo, size=(_SMOOTHING_PINGS, 3), mode="nearest")
     first = _first_rise(echo, skip)
     first = _with_local_steps(echo, first, skip)
-    return _median_smoothed(first * range_m / _BINS, window_pings)
+    return _median_smoothed(first * range_m / _BINS)
 
 
 def _common_range(survey: Survey, range_m: float) -> FloatArray:
@@ -130,16 +126,16 @@ def _with_local_steps(echo: FloatArray, first: FloatArray, skip: int) -> FloatAr
     return np.where(better, best.astype(np.float64), first)
 
 
-def _median_smoothed(values: FloatArray, window: int) -> FloatArray:
-    """Return the median over `window` rows; gaps up to that length are interpolated."""
+def _median_smoothed(values: FloatArray) -> FloatArray:
+    """Return the median over `_MEDIAN_PINGS` rows; gaps up to that length are interpolated."""
     known = np.flatnonzero(np.isfinite(values))
     if not known.size:
         return values
     rows = np.arange(values.shape[0])
     filled = np.interp(rows, known, values[known])
-    smooth = np.asarray(median_filter(filled, size=window, mode="nearest"), dtype=np.float64)
+    smooth = np.asarray(median_filter(filled, size=_MEDIAN_PINGS, mode="nearest"), dtype=np.float64)
     nearest = np.min(np.abs(rows[:, None] - known[_neighbours(rows, known)]), axis=1)
-    smooth[nearest > window // 2] = np.nan
+    smooth[nearest > _MEDIAN_PINGS // 2] = np.nan
     return smooth
 
 

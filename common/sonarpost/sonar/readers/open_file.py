@@ -59,23 +59,17 @@ class CheckedFile:
             SurveyFileError: Not UTF-8, a line over 64 KiB, or an unreadable file; the message contains the line number.
         """
         reader = SequentialReader(self)
-        rest = b""
-        number = 0
-        while reader.remaining or rest:
-            rest += reader.read(min(_LINE_BYTES, reader.remaining), f"line {number + 1}")
-            *lines, rest = rest.split(b"\n")
-            if not reader.remaining:
-                lines, rest = [*lines, rest] if rest else lines, b""
-            elif len(rest) > _LINE_BYTES:
-                lines = [*lines, rest]  # too long, although its end is not read yet
-            for line in lines:
-                number += 1
-                if len(line) > _LINE_BYTES:
-                    raise self.error(f"line {number}", f"over {_LINE_BYTES} bytes", "shorter lines")
-                try:
-                    yield line.decode("utf-8-sig" if number == 1 else "utf-8") + "\n"
-                except UnicodeDecodeError as error:
-                    raise self.error(f"line {number}", str(error), "UTF-8") from error
+        offset = number = 0
+        while offset < self.size_bytes:
+            number += 1
+            line, end, _ = reader.peek(offset, _LINE_BYTES + 1).partition(b"\n")
+            if len(line) > _LINE_BYTES:
+                raise self.error(f"line {number}", f"over {_LINE_BYTES} bytes", "shorter lines")
+            offset += len(line) + len(end)
+            try:
+                yield line.decode("utf-8-sig" if number == 1 else "utf-8") + "\n"
+            except UnicodeDecodeError as error:
+                raise self.error(f"line {number}", str(error), "UTF-8") from error
 
     def check_unchanged(self) -> None:
         """Check that the file was not written to since it was opened.
@@ -109,35 +103,15 @@ class CheckedFile:
 
 
 class SequentialReader:
-    """Buffered sequential reading of an open file. Several readers may use one file at the same time."""
+    """Buffered reading of an open file from its beginning on. Several readers may use one file at the same time."""
 
-    def __init__(self, file: CheckedFile, offset: int = 0) -> None:
+    def __init__(self, file: CheckedFile) -> None:
         self.file = file
-        self.offset = offset
         self._buffer = b""
-        self._buffer_offset = offset
-
-    @property
-    def remaining(self) -> int:
-        """Number of bytes up to the end of the file."""
-        return self.file.size_bytes - self.offset
-
-    def read(self, count: int, place: str) -> bytes:
-        """Return the next `count` bytes and advance.
-
-        Raises:
-            SurveyFileError: The file is shorter; the message contains `place`.
-        """
-        start = self.offset - self._buffer_offset
-        if start + count > len(self._buffer):
-            ahead = max(count, min(_BUFFER_BYTES, self.remaining))
-            self._buffer = self.file.read_at(self.offset, ahead, place)
-            self._buffer_offset, start = self.offset, 0
-        self.offset += count
-        return self._buffer[start : start + count]
+        self._buffer_offset = 0
 
     def peek(self, offset: int, count: int) -> bytes:
-        """Return `count` bytes from `offset`, fewer at the end of the file; the place of `read` stays.
+        """Return `count` bytes from `offset`, fewer at the end of the file.
 
         Raises:
             SurveyFileError: The file cannot be read.
