@@ -1,11 +1,14 @@
-"""Release of contacts to the compressor: as many as the acoustic transmit queue has credit for."""
+"""Release of contacts to the compressor: as many as the acoustic transmit queue has credit for.
+
+Picks of a person are released first, then the most confident contacts.
+"""
 
 from __future__ import annotations
 
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import msgpack
@@ -18,7 +21,6 @@ from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.errors import DeliveryError, PayloadError
 from sonarpost.logs import kv
 from sonarpost.messages import QueueState, Snippet
-from sonarpost.services.atd_stub.pending_contacts import PendingContacts
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +30,11 @@ RELEASE_EXPIRY_S: Final = 600.0
 """A released contact that the modem service has not accepted by then was quarantined on the way."""
 _COMPRESSOR: Final = "compressor"
 _STATE_NAME: Final = "releases"
+_PREFIX: Final = "pending/"
+_MAX_CONFIDENCE: Final = 2.0
+_STEPS: Final = 1_000_000
+_PICK_RANK: Final = -1
+"""Sorts before all ranks by confidence: `-` comes before the digits."""
 
 
 class ReleaseCredit:
@@ -100,6 +107,62 @@ class ReleaseCredit:
         return max(self._limit - self.in_flight(undelivered), 0)
 
 
+class PendingContacts:
+    """Durable priority list of the snippets that wait for release.
+
+    The name of a stored snippet sorts by confidence, then by age. Picks come first, other contacts without confidence
+    last. All content is in the store: a unit of work that is not committed changes nothing. One thread
+    adds, one thread removes.
+
+    Args:
+        store: The service's store.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        numbers = (name.rpartition(":")[2] for name in store.state_names(_PREFIX))
+        self._next_number = 1 + max((int(number) for number in numbers if number.isdecimal()), default=0)
+
+    def __len__(self) -> int:
+        return len(self._store.state_names(_PREFIX))
+
+    def add(self, effects: UnitOfWork, snippets: Sequence[Snippet]) -> None:
+        """Queue snippets by falling confidence, then in the order of detection."""
+        for snippet in snippets:
+            confidence = snippet.contact.atd_confidence
+            self._put(effects, round((_MAX_CONFIDENCE - (confidence or 0.0)) * _STEPS) + (confidence is None), snippet)
+
+    def add_picks(self, effects: UnitOfWork, snippets: Sequence[Snippet]) -> None:
+        """Queue snippets of picks before all others. Those of the same contacts that wait here are removed."""
+        picked = {snippet.contact.contact_id for snippet in snippets}
+        for name in self._store.state_names(_PREFIX):
+            # The other thread may have removed it.
+            waiting = self._store.read_state(name, lambda payload: wire.decode(Snippet, payload, "contact"), None)
+            if waiting is not None and waiting.contact.contact_id in picked:
+                effects.delete_state(name)
+        for snippet in snippets:
+            self._put(effects, _PICK_RANK, snippet)
+
+    def _put(self, effects: UnitOfWork, rank: int, snippet: Snippet) -> None:
+        effects.put_state(f"{_PREFIX}{rank:08d}:{self._next_number:015d}", wire.encode(snippet))
+        self._next_number += 1
+
+    def remove_first(self, effects: UnitOfWork, count: int | None) -> list[bytes]:
+        """Remove up to `count` (None for all) of the most confident snippets; return them encoded, in this order.
+
+        Raises:
+            DeliveryError: The store cannot be read.
+        """
+        payloads = []
+        for name in sorted(self._store.state_names(_PREFIX))[:count]:
+            payload = self._store.get_state(name)
+            if payload is None:
+                continue  # replaced by a pick
+            effects.delete_state(name)
+            payloads.append(payload)
+        return payloads
+
+
 class ContactRelease:
     """Stores contacts that are ready and releases the most confident first.
 
@@ -170,23 +233,13 @@ class ContactRelease:
         """Let `run` check at once whether contacts can be released."""
         self._wake.set()
 
-    def add(self, effects: UnitOfWork, snippets: tuple[Snippet, ...]) -> None:
-        """Commit `effects` together with snippets that are ready for release.
+    def add(self, effects: UnitOfWork, snippets: tuple[Snippet, ...], *, are_picks: bool = False) -> None:
+        """Commit `effects` together with snippets that are ready for release; those of picks are released first.
 
         Raises:
             DeliveryError: The store cannot be written; nothing was stored.
         """
-        self._pending.add(effects, snippets)
-        self._commit(effects)
-        self._wake.set()
-
-    def add_picks(self, effects: UnitOfWork, snippets: tuple[Snippet, ...]) -> None:
-        """As `add`, for snippets of picks: they are released before all others.
-
-        Raises:
-            DeliveryError: The store cannot be written; nothing was stored.
-        """
-        self._pending.add_picks(effects, snippets)
+        (self._pending.add_picks if are_picks else self._pending.add)(effects, snippets)
         self._commit(effects)
         self._wake.set()
 

@@ -6,7 +6,7 @@ import hashlib
 import logging
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -209,7 +209,7 @@ class AtdStubService(Service[AtdStubConfig]):
         present = {content for file, content in self._processed.items() if file not in removed}
         for name, entry in entries.items():
             if name not in present and now_utc_s - entry["processed_utc_s"] > config.retain_days * DAY_S:
-                effects.delete_state(_state_name(name))
+                effects.delete_state(_FILE + name)
                 effects.delete_state(_PICKS + name)
         if removed:
             effects.count("files_removed", len(removed))
@@ -247,18 +247,17 @@ class AtdStubService(Service[AtdStubConfig]):
         new = tuple(file for file in files if file not in self._processed)
         complete = self._stable_files.update(new, time.monotonic())
         self._files_waiting = len(new)
-        for file in complete:
+        self._process_each(complete, self._process)
+
+    def _process_each(self, files: Iterable[InputFile], process: Callable[[InputFile], None]) -> None:
+        """Process files until the service stops. One that cannot be read is tried again with the next poll."""
+        for file in files:
             if self.stopping.is_set():
                 return
             try:
-                content = self._process(file)
+                process(file)
             except OSError as error:
-                # The files after it are processed first; it is tried again with the next poll.
                 self._unreadable[file.path.name] = f"{type(error).__name__}: {error}"
-                continue
-            if content:
-                self._processed[file] = content
-                self._files_waiting -= 1
 
     def _log_incomplete(self, files: tuple[InputFile, ...]) -> None:
         """Log each recording with missing files once."""
@@ -280,20 +279,17 @@ class AtdStubService(Service[AtdStubConfig]):
         self._unreadable |= unreadable
         self._handled_picks &= surveys.keys()
         new = tuple(file for file in surveys if file not in self._handled_picks)
-        for file in self._stable_picks.update(new, time.monotonic()):
-            if self.stopping.is_set():
-                return
-            try:
-                if (result := self._measured_picks(file, surveys[file])) is not None:
-                    self._commit_picks(file, self._processed[surveys[file]], result)
-            except OSError as error:
-                self._unreadable[file.path.name] = f"{type(error).__name__}: {error}"
-                continue
+
+        def process(file: InputFile) -> None:
+            content = self._processed[surveys[file]]
+            if (result := self._measured_picks(file, surveys[file], content)) is not None:
+                self._commit_picks(file, content, result)
             self._handled_picks.add(file)
 
-    def _measured_picks(self, file: InputFile, survey: InputFile) -> PicksResult | None:
+        self._process_each(self._stable_picks.update(new, time.monotonic()), process)
+
+    def _measured_picks(self, file: InputFile, survey: InputFile, content: str) -> PicksResult | None:
         """Return the contacts of a file of picks; None if it was removed, or the survey cannot be read."""
-        content = self._processed[survey]
         before = self.store.read_state(_PICKS + content, handled_lines, ())
         try:
             return contacts_of_picks(survey.path, content, file.path, before, self.platform.id, self.config)
@@ -316,28 +312,28 @@ class AtdStubService(Service[AtdStubConfig]):
             effects.count("picks_ignored", len(result.errors))
         if result.snippets:
             effects.count("contacts_picked", len(result.snippets))
-        if self.config.snippet_dir is not None:
-            for snippet in result.snippets:
-                write_snippet(self.config.snippet_dir, snippet)
-        self._release.add_picks(effects, result.snippets)
+        self._write_snippets(result.snippets)
+        self._release.add(effects, result.snippets, are_picks=True)
         for reason in result.errors:
             log.warning("Pick ignored", extra=kv(file=file.path.name, reason=printable(reason)))
         for snippet in result.snippets:
             log.info("Contact picked", extra=kv(contact_id=snippet.contact.contact_id, file=snippet.source))
 
-    def _process(self, file: InputFile) -> str:
-        """Process a file; return its digest, empty if it was removed or changed and has to be tried again."""
+    def _process(self, file: InputFile) -> None:
+        """Process a file; one that is removed or changed during this is tried again with the next poll."""
         try:
-            before = _identities(file)
-            content = _content_of(file)
+            before, content = _identities(file), _content_of(file)
         except FileNotFoundError:
-            return ""
-        if (entry := self.store.read_state(_state_name(content), _entry, None)) is not None:
+            return
+        if (entry := self.store.read_state(_FILE + content, _entry, None)) is not None:
             self._skip_known(file, content, entry)
-            return content
-        return content if self._detect(file, content, before) else ""
+        elif not self._detect(file, content, before):
+            return
+        self._processed[file] = content
+        self._files_waiting -= 1
 
     def _detect(self, file: InputFile, content: str, before: _Identities) -> bool:
+        """Detect the contacts of a file; return False if it was removed or changed."""
         path = file.path
         started = time.perf_counter()
         try:
@@ -373,7 +369,7 @@ class AtdStubService(Service[AtdStubConfig]):
     def _commit_result(self, path: Path, content: str, result: DetectionResult, duration_s: float) -> None:
         effects = UnitOfWork()
         entry = {"file": printable(path.name), "contacts": result.contact_count, "processed_utc_s": time.time()}
-        effects.put_state(_state_name(content), msgpack.packb(entry))
+        effects.put_state(_FILE + content, msgpack.packb(entry))
         effects.count("files_processed")
         if result.masked_pings:
             effects.count("pings_masked", result.masked_pings)
@@ -431,9 +427,7 @@ class AtdStubService(Service[AtdStubConfig]):
     def _commit_contacts(self, effects: UnitOfWork, snippets: tuple[Snippet, ...]) -> None:
         """Count and commit contacts that are ready for release, with `effects`; their files are written before."""
         effects.count("contacts_detected", len(snippets))
-        if self.config.snippet_dir is not None:
-            for snippet in snippets:
-                write_snippet(self.config.snippet_dir, snippet)
+        self._write_snippets(snippets)
         self._release.add(effects, snippets)
         self._file_ends.committed()
         for snippet in snippets:
@@ -446,6 +440,11 @@ class AtdStubService(Service[AtdStubConfig]):
                     confidence=snippet.contact.atd_confidence,
                 ),
             )
+
+    def _write_snippets(self, snippets: tuple[Snippet, ...]) -> None:
+        if self.config.snippet_dir is not None:
+            for snippet in snippets:
+                write_snippet(self.config.snippet_dir, snippet)
 
     def _release_expired_contacts(self) -> None:
         effects = UnitOfWork()
@@ -474,7 +473,7 @@ class AtdStubService(Service[AtdStubConfig]):
         log.error("File quarantined", extra=kv(file=file.path.name, reason=reason))
         effects = UnitOfWork()
         entry = {"file": printable(file.path.name), "refused": reason, "processed_utc_s": time.time()}
-        effects.put_state(_state_name(content), msgpack.packb(entry))
+        effects.put_state(_FILE + content, msgpack.packb(entry))
         effects.count("files_quarantined")
         self.commit(effects)
         self._move_to_quarantine(file, content, reason)
@@ -482,15 +481,14 @@ class AtdStubService(Service[AtdStubConfig]):
     def _move_to_quarantine(self, file: InputFile, content: str, reason: str) -> None:
         path, parts = file.path, self._own_parts(file)
         folder = self.config.quarantine_dir or self.config.input_dir / "quarantine"
-        if any((folder / part.relative_to(path.parent)).exists() for part in parts):
+        names = [str(part.relative_to(path.parent)) for part in parts]
+        if any((folder / name).exists() for name in names):
             # Another bad file of this name is there and must not be overwritten.
-            names = [f"{path.stem}-{content[:8]}{path.suffix}"]
+            unique = f"{path.stem}-{content[:8]}"
             if len(parts) > 1:
-                # Files of one recording refer to each other by name.
-                folder /= f"{path.stem}-{content[:8]}"
-                names = [str(part.relative_to(path.parent)) for part in parts]
-        else:
-            names = [str(part.relative_to(path.parent)) for part in parts]
+                folder /= unique  # files of one recording refer to each other by name
+            else:
+                names = [unique + path.suffix]
         try:
             folder.mkdir(parents=True, exist_ok=True)
             write_atomically(folder / f"{names[0]}.reason.txt", f"{reason}\n".encode())
@@ -552,16 +550,8 @@ def _identities(file: InputFile) -> _Identities:
 
 
 def _is_unchanged(file: InputFile, before: _Identities) -> bool:
-    """Return whether the files exist and have not been replaced or written.
-
-    Raises:
-        OSError: A file cannot be examined.
-    """
+    """Return whether the files exist and have not been replaced or written."""
     try:
         return _identities(file) == before
     except FileNotFoundError:
         return False
-
-
-def _state_name(content: str) -> str:
-    return _FILE + content

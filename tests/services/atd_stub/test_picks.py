@@ -7,7 +7,7 @@ from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.detection.picks import PICKED, picks_path
 from sonarpost.messages import Contact, Pixels, Snippet
-from sonarpost.services.atd_stub.pending_contacts import PendingContacts
+from sonarpost.services.atd_stub.release import PendingContacts
 from sonarpost.sonar.readers import read_survey
 
 

@@ -13,8 +13,7 @@ from sonarpost import keys, wire
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.messages import Contact, Pixels, QueuedImage, QueueState, Snippet
-from sonarpost.services.atd_stub.pending_contacts import PendingContacts
-from sonarpost.services.atd_stub.release import RELEASE_EXPIRY_S, ReleaseCredit
+from sonarpost.services.atd_stub.release import RELEASE_EXPIRY_S, PendingContacts, ReleaseCredit
 from sonarpost.sonar.image_files import write_tiff
 
 
