@@ -29,7 +29,7 @@ from sonarpost.detection.detector import (
     detection_of,
     search,
 )
-from sonarpost.detection.matched_filter import Peak, highlight_size_cells, matched_response
+from sonarpost.detection.matched_filter import MatchedResponse, Peak, highlight_size_cells, matched_response
 from sonarpost.detection.normalisation import LevelGrid, normalise_side
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.detection.stream import STRIP_PINGS, FileOrigin, PingOrigin, contact_record
@@ -310,7 +310,7 @@ class _StripPicks:
         lowest = settings.model_copy(update={"confidence_threshold": min(LISTED_CONFIDENCES), "max_contacts": None})
         self._candidates = search(self.survey, lowest, source.options).detections
         self._altitudes_m = altitudes_m(self.survey)
-        self._sides: dict[Side, _SideGrid] = {}
+        self._sides: dict[Side, tuple[LevelGrid, MatchedResponse] | None] = {}
 
     def at(self, located: LocatedPick) -> PickedDetection:
         """Return the detection at a pick: the most confident candidate, else what can be measured there."""
@@ -320,9 +320,10 @@ class _StripPicks:
                 return PickedDetection(candidate, is_candidate=True, is_measured=True)
         if pick.side not in self._sides:
             grid = normalise_side(self.survey, pick.side, self._settings, self._altitudes_m)
-            self._sides[pick.side] = _SideGrid(grid, self._settings)
-        place = self._sides[pick.side].measured_at(row, pick.sample)
-        found = None if place is None else self._detection(*place)
+            self._sides[pick.side] = None if grid is None else (grid, matched_response(grid, self._settings))
+        side = self._sides[pick.side]
+        place = None if side is None else _measured_at(*side, row, pick.sample, self._settings)
+        found = None if side is None or place is None else self._detection(side[0], place)
         is_measured = found is not None
         if found is None:
             found = self._detection(*self._single_sample(row, pick))
@@ -361,51 +362,43 @@ class _StripPicks:
         return grid, place
 
 
-class _SideGrid:
-    """One side of a strip, for measurements at single places; `grid` is None for a side without a usable channel."""
+def _measured_at(
+    grid: LevelGrid, response: MatchedResponse, row: int, sample: int, settings: DetectorSettings
+) -> Measurement | None:
+    """Return highlight and shadow near a place of one side of a strip; None if they cannot be measured.
 
-    def __init__(self, grid: LevelGrid | None, settings: DetectorSettings) -> None:
-        self._grid = grid
-        self._settings = settings
-        self._response = None if grid is None else matched_response(grid, settings)
+    Nothing is measured where the highlight does not exceed the seabed around it, or where its centre is farther
+    from the pick than the centres of one contact are from each other.
+    """
+    cell = sample // grid.samples_per_cell
+    peak = _peak_near(grid, response, row, cell, settings)
+    measurement = None if peak is None else measure(grid, peak, settings)
+    if measurement is None or measurement.scores.cfar < _MIN_HIGHLIGHT:
+        return None
+    along_m = abs(measurement.row - row) * grid.row_along_m
+    across_m = abs(measurement.cell - cell) * grid.cell_across_m
+    is_near = along_m < settings.separation_along_m and across_m < settings.separation_across_m
+    return measurement if is_near else None
 
-    def measured_at(self, row: int, sample: int) -> tuple[LevelGrid, Measurement] | None:
-        """Return the grid, and highlight and shadow near a place; None if they cannot be measured.
 
-        Nothing is measured where the highlight does not exceed the seabed around it, or where its centre is farther
-        from the pick than the centres of one contact are from each other.
-        """
-        grid, settings = self._grid, self._settings
-        if grid is None or self._response is None:
-            return None
-        peak = self._peak(grid, row, sample // grid.samples_per_cell)
-        measurement = None if peak is None else measure(grid, peak, settings)
-        if measurement is None or measurement.scores.cfar < _MIN_HIGHLIGHT:
-            return None
-        along_m = abs(measurement.row - row) * grid.row_along_m
-        across_m = abs(measurement.cell - sample // grid.samples_per_cell) * grid.cell_across_m
-        if along_m >= settings.separation_along_m or across_m >= settings.separation_across_m:
-            return None
-        return grid, measurement
-
-    def _peak(self, grid: LevelGrid, row: int, cell: int) -> Peak | None:
-        """Return the place of the best response of the matched filter near a cell; None in the water column."""
-        assert self._response is not None
-        reach_rows, reach_cells = (math.ceil(_SNAP_M / each) for each in (grid.row_along_m, grid.cell_across_m))
-        top, left = max(row - reach_rows, 0), max(cell - reach_cells, 0)
-        window = np.s_[top : row + reach_rows + 1, left : cell + reach_cells + 1]
-        known = np.isfinite(grid.level[window])
-        if not known.any():
-            return None
-        score = np.where(known, self._response.score[window], -1.0)
-        best_row, best_cell = (int(each) for each in np.unravel_index(int(np.argmax(score)), score.shape))
-        best = float(score[best_row, best_cell])
-        if best <= 0.0:
-            # No response: the nearest known cell.
-            rows, cells = np.nonzero(known)
-            nearest = int(np.argmin(np.abs(rows + top - row) + np.abs(cells + left - cell)))
-            best_row, best_cell, best = int(rows[nearest]), int(cells[nearest]), 0.0
-        best_row, best_cell = top + best_row, left + best_cell
-        index = int(self._response.highlight_index[best_row, best_cell])
-        rows_of, cells_of = highlight_size_cells(grid, self._settings.highlight_sizes_m[index])
-        return Peak(best_row, best_cell, best, rows_of, cells_of)
+def _peak_near(
+    grid: LevelGrid, response: MatchedResponse, row: int, cell: int, settings: DetectorSettings
+) -> Peak | None:
+    """Return the place of the best response of the matched filter near a cell; None in the water column."""
+    reach_rows, reach_cells = (math.ceil(_SNAP_M / each) for each in (grid.row_along_m, grid.cell_across_m))
+    top, left = max(row - reach_rows, 0), max(cell - reach_cells, 0)
+    window = np.s_[top : row + reach_rows + 1, left : cell + reach_cells + 1]
+    known = np.isfinite(grid.level[window])
+    if not known.any():
+        return None
+    score = np.where(known, response.score[window], -1.0)
+    best_row, best_cell = (int(each) for each in np.unravel_index(int(np.argmax(score)), score.shape))
+    best = float(score[best_row, best_cell])
+    if best <= 0.0:
+        # No response: the nearest known cell.
+        rows, cells = np.nonzero(known)
+        nearest = int(np.argmin(np.abs(rows + top - row) + np.abs(cells + left - cell)))
+        best_row, best_cell, best = int(rows[nearest]), int(cells[nearest]), 0.0
+    best_row, best_cell = top + best_row, left + best_cell
+    index = int(response.highlight_index[best_row, best_cell])
+    return Peak(best_row, best_cell, best, *highlight_size_cells(grid, settings.highlight_sizes_m[index]))

@@ -39,6 +39,8 @@ _GAP_LIMIT_INTERVALS: Final = 3.0
 _MAX_GAP_M: Final = 30.0
 _RANGE_TOLERANCE: Final = 0.01
 _MAX_SAMPLE_BYTES: Final = 1 << 24
+_CONTACT_FIELDS: Final = Contact.model_fields.keys() & Detection.__dataclass_fields__.keys()
+"""Fields of a detection that its contact record has under the same name."""
 
 T = TypeVar("T")
 """What the caller makes of a detection."""
@@ -85,34 +87,19 @@ def contact_record(detection: Detection, origin: FileOrigin, vehicle_id: str, so
         sonar_id: Sonar, as the file names it.
     """
     d = detection
+    fields = {name: getattr(d, name) for name in _CONTACT_FIELDS}
+    if d.shadow_is_cut:
+        fields["height_m"] = None
     return Contact(
         contact_id=origin.contact_id(d),
         vehicle_id=vehicle_id,
         sonar_id=sonar_id,
         line_name=origin.line_name,
-        ping_number=d.ping_number,
         channel=d.side.value,
-        time_utc_s=d.time_utc_s,
         lat_deg=d.position.lat_deg if d.position else None,
         lon_deg=d.position.lon_deg if d.position else None,
-        position_sigma_m=d.position_sigma_m,
-        position_note=d.position_note,
-        depth_m=d.depth_m,
-        altitude_m=d.altitude_m,
-        heading_deg=d.heading_deg,
-        speed_mps=d.speed_mps,
-        slant_range_m=d.slant_range_m,
-        ground_range_m=d.ground_range_m,
-        atd_class=d.atd_class,
         atd_confidence=d.confidence,
-        length_m=d.length_m,
-        width_m=d.width_m,
-        shadow_m=d.shadow_m,
-        height_m=None if d.shadow_is_cut else d.height_m,
-        pixel_along_m=d.pixel_along_m,
-        pixel_across_m=d.pixel_across_m,
-        p_mine_like=d.p_mine_like,
-        p_other_object=d.p_other_object,
+        **fields,
     )
 
 

@@ -23,7 +23,6 @@ from sonarpost.cli.detection.images import add_image_options, check_image_option
 from sonarpost.cli.detection.options import (
     add_pick_option,
     add_transmission_options,
-    contacts_of_picks,
     located_picks,
     transmissions_of,
 )
@@ -40,7 +39,7 @@ from sonarpost.cli.shared import (
 from sonarpost.cli.survey.plot import draw_waterfall, reduce_survey
 from sonarpost.detection.detector import MINE_LIKE, Detection, counts_text
 from sonarpost.detection.difficulty import Difficulty, combined
-from sonarpost.detection.picks import PICKED, LocatedPick, PickedDetection
+from sonarpost.detection.picks import PICKED, LocatedPick, PickedDetection, is_at_detection, measure_picks
 from sonarpost.detection.settings import DetectorSettings, checked_settings, load_settings
 from sonarpost.detection.snippets import cut_snippet, ground_projected_image
 from sonarpost.detection.stream import (
@@ -273,17 +272,22 @@ class _Detection:
     def add_picks(self, picks: Sequence[LocatedPick]) -> None:
         """Add the contacts of picks to the only file, and mark those that the detector has listed."""
         (result,) = self._results
-        listed = [contact.detection for contact in result.contacts]
-        path, origin = result.info.path, result.origin
-        marked, found = contacts_of_picks(
-            path, origin, picks, listed, self._describe_pick, self._settings, self._options
-        )
-        result.contacts = [
-            replace(contact, is_picked=True) if number in marked else contact
-            for number, contact in enumerate(result.contacts)
-        ]
-        # Two picks may be on one object.
-        result.contacts += {contact.record.contact_id: contact for contact in found}.values()
+        others = []
+        for pick in picks:
+            at_pick = (
+                number
+                for number, contact in enumerate(result.contacts)
+                if is_at_detection(contact.detection, pick.row, pick.pick, self._settings)
+            )
+            if (number := next(at_pick, None)) is None:
+                others.append(pick)
+            else:
+                result.contacts[number] = replace(result.contacts[number], is_picked=True)
+        if others:
+            with open_survey(result.info.path, self._options) as source:
+                found = measure_picks(source, result.origin, others, self._describe_pick, self._settings)
+            # Two picks may be on one object.
+            result.contacts += {contact.record.contact_id: contact for contact in found}.values()
         result.sort()
 
     def _assign(self, contacts: Sequence[StreamContact[ListedContact]]) -> None:

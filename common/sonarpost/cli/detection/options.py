@@ -5,30 +5,17 @@ import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
 
 from pydantic import ValidationError
 
 from sonarpost.cli.shared import option
-from sonarpost.detection.detector import Detection
-from sonarpost.detection.picks import (
-    DescribePick,
-    LocatedPick,
-    is_at_detection,
-    locate_picks,
-    measure_picks,
-    parse_pick,
-)
-from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.stream import FileOrigin
+from sonarpost.detection.picks import LocatedPick, locate_picks, parse_pick
 from sonarpost.detection.transmissions import MARGIN_AFTER_S, MARGIN_BEFORE_S, TransmitIntervals
 from sonarpost.errors import ConfigError
 from sonarpost.messages import Transmission
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.readers import open_survey
 from sonarpost.wire import first_error
-
-T = TypeVar("T")
 
 _WHERE = "--pick"
 
@@ -62,40 +49,6 @@ def located_picks(texts: Sequence[str], files: Sequence[Path], options: SurveyOp
     if errors:
         raise errors[0]
     return located
-
-
-def contacts_of_picks(
-    path: Path,
-    origin: FileOrigin,
-    picks: Sequence[LocatedPick],
-    listed: Sequence[Detection],
-    describe: DescribePick[T],
-    settings: DetectorSettings,
-    options: SurveyOptions,
-) -> tuple[frozenset[int], list[T]]:
-    """Return which detections of a file are picked, and what `describe` returns for the other picks.
-
-    Args:
-        path: The survey file.
-        origin: The same, as the origin of its pings.
-        picks: Picks in this file.
-        listed: Detections in this file; their ping indices are those of the file.
-        describe: Called for each pick that is on none of them.
-        settings: Settings of the detector.
-        options: Survey options.
-    """
-    on_listed: set[int] = set()
-    others = []
-    for each in picks:
-        number = next((n for n, d in enumerate(listed) if is_at_detection(d, each.row, each.pick, settings)), None)
-        if number is None:
-            others.append(each)
-        else:
-            on_listed.add(number)
-    if not others:
-        return frozenset(on_listed), []
-    with open_survey(path, options) as source:
-        return frozenset(on_listed), measure_picks(source, origin, others, describe, settings)
 
 
 def add_transmission_options(parser: argparse.ArgumentParser) -> None:
