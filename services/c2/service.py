@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import lru_cache, partial
 
 from typing_extensions import override
@@ -24,7 +22,7 @@ from sonarpost.archive.journal import Accepted, JournalEntry
 from sonarpost.bus.connectivity import declare_presence
 from sonarpost.bus.session import open_with_retry
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.records import OutboxItem, platform_of, queue_of
+from sonarpost.delivery.records import OutboxItem
 from sonarpost.delivery.transaction import Transaction
 from sonarpost.errors import DeliveryError, PayloadError, SonarpostError
 from sonarpost.logs import kv
@@ -41,7 +39,6 @@ from sonarpost.messages import (
 )
 from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, ServiceStoppingError, UnitOfWork
-from sonarpost.services.c2 import tasking
 from sonarpost.services.c2.accepted import accepted_fields, accepted_payload
 from sonarpost.services.c2.archive import Archive
 from sonarpost.services.c2.config import C2Config
@@ -49,13 +46,10 @@ from sonarpost.services.c2.decoding import Decoding
 from sonarpost.services.c2.inputs import inputs
 from sonarpost.services.c2.json_form import ENCODING, json_payload
 from sonarpost.services.c2.queries import QueryService
-from sonarpost.services.c2.tasking import Tasking
+from sonarpost.services.c2.tasking_delivery import CONSUMER, TaskingDelivery
 
 log = logging.getLogger(__name__)
 
-COMMAND_PRIORITY = 1
-COMMENT_PRIORITY = 2
-CONSUMER = "relay"
 VERIFICATION_INTERVAL_S = 60.0
 RETRY_S = 1.0
 TAKE_OVER_INTERVAL_S = 5.0
@@ -98,12 +92,8 @@ class C2Service(Service[C2Config]):
         self._archive = Archive(config, self._owner())
         self._queries = QueryService(self._archive, config.site, self.count)
         self._retention = Retention(self._apply_retention, self.stopping)
-        self._changed = threading.Event()
-        self._changed_names: set[str] = set()
-        self._changed_lock = threading.Lock()
+        self._tasking = TaskingDelivery(self.store, self._archive, self._publish_stored)
         self._background_faults: dict[str, str] = {}
-        # Of the records that are handled and not committed yet.
-        self._uncommitted: dict[str, bytes] = {}
         self._stored_versions = Counter[str]()
         folder = platform.state_dir / CODEBOOKS
         self.decoding = Decoding(
@@ -154,7 +144,7 @@ class C2Service(Service[C2Config]):
         vessel = keys.tasking_vessel(key)
         if isinstance(record, Comment) and record.vessel_id != vessel:
             raise PayloadError(key, "vessel_id", record.vessel_id, "the vessel in the key")
-        self._is_known(vessel, key, record)
+        self._tasking.is_known(vessel, key, record)
         return None
 
     @override
@@ -230,7 +220,7 @@ class C2Service(Service[C2Config]):
             self._accept_image(key, image_parts.coded_image(record, keys.part_vessel(key), key), effects)
         else:
             assert isinstance(record, (Comment, Command))
-            self._send_to_vessel(keys.tasking_vessel(key), key, record, effects)
+            self._tasking.send(keys.tasking_vessel(key), key, record, effects)
 
     def _publish_status(self, status: ReceivedStatus, effects: UnitOfWork) -> None:
         """Publish the status of a vehicle. It is not archived: a newer one replaces it."""
@@ -304,7 +294,7 @@ class C2Service(Service[C2Config]):
             finally:
                 if is_held:
                     self._archive.forget()
-                    self._uncommitted.clear()
+                    self._tasking.forget()
 
     def _store_decision(self, decision: Decision, effects: UnitOfWork) -> None:
         new = self._archive.store_decision(decision)
@@ -328,131 +318,53 @@ class C2Service(Service[C2Config]):
         if any(effects.counts.get("images_stored") for effects in handled):
             self._retention.wake()
 
-    # Records for vessels
-
-    def _is_known(self, vessel: str, key: str, record: Comment | Command) -> bool:
-        """Return whether a record was accepted before.
-
-        Raises:
-            PayloadError: A different one with this identifier was.
-        """
-        name = tasking.state_name(vessel, *tasking.kind_and_id(record))
-        known = self._uncommitted.get(name) or self.store.get_state(name)
-        if known is not None:
-            tasking.reject_conflict(Tasking.unpack(known), record, key)
-            return True
-        kind, record_id = tasking.kind_and_id(record)
-        return self._is_foreign(vessel, key, record, self._archive.index().foreign_tasking(vessel, kind, record_id))
-
-    def _is_foreign(self, vessel: str, key: str, record: Comment | Command, payload: bytes | None) -> bool:
-        """Return whether another c2 has a record; see `_is_known` for errors."""
-        if payload:
-            tasking.reject_conflict(Tasking(vessel, tasking.kind_and_id(record)[0], payload), record, key)
-        return payload is not None
-
-    def _send_to_vessel(self, vessel: str, key: str, record: Comment | Command, effects: UnitOfWork) -> None:
-        if self._is_known(vessel, key, record):
-            effects.count("tasking_repeated")
-            return
-        payload = effects.payload
-        kind, record_id = tasking.kind_and_id(record)
-        item = Tasking(vessel, kind, payload, changed_utc_s=time.time())
-        # Another c2 can have accepted it at the same time.
-        if self._is_foreign(vessel, key, record, self._archive.index().claim_tasking(item.row(), payload)):
-            effects.count("tasking_repeated")
-            return
-        priority = COMMENT_PRIORITY if isinstance(record, Comment) else COMMAND_PRIORITY
-        # One queue for each vessel: an unreachable vessel does not delay the others.
-        effects.send_payload(item.key, queue_of(CONSUMER, vessel), payload, type(record), priority=priority)
-        packed = item.pack()
-        effects.put_state(item.name, packed)
-        self._uncommitted[item.name] = packed
-        effects.count("tasking_accepted")
-        self._mark_changed(item.name)
-        log.info("Record queued for a vessel", extra=kv(vessel=vessel, kind=kind, record_id=record_id))
-
     @override
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> None:
         """Store that a vessel has accepted or refused a record, in the transaction of its acknowledgement."""
-        vessel = platform_of(item.queue)
-        was = tasking.of_payload(vessel, item.key, item.payload)
-        now = replace(
-            was, state="delivered" if reason is None else "refused", reason=reason or "", changed_utc_s=time.time()
-        )
-        tx.put_state(now.name, now.pack())
-        self._mark_changed(now.name)
+        self._tasking.acknowledged(tx, item, reason)
 
-    def _mark_changed(self, name: str) -> None:
-        with self._changed_lock:
-            self._changed_names.add(name)
-        self._changed.set()
+    # Background work
 
     def _publish_states(self) -> None:
-        """Publish and index changed states after their commit; after a start all states once."""
-        # Outside the lock: a transaction, for which the store waits, can wait for it in `_mark_changed`.
-        names = self.store.state_names(tasking.PREFIX)
-        with self._changed_lock:
-            self._changed_names.update(names)
+        """Publish and index changed states of comments and commands after their commit; after a start all states."""
+        self._tasking.mark_all_changed()
         while not self.stopping.is_set():
-            self._changed.clear()
-            try:
-                self._publish_changed()
-                self._background_faults.pop("tasking", None)
-            except ServiceStoppingError:
-                return
-            except Exception as error:  # noqa: BLE001 - reported
-                self._background_fault("tasking", error)
-            self._changed.wait(RETRY_S)
+            self._tasking.changed.clear()
+            self._try("tasking", self._tasking.publish_changed)
+            self._tasking.changed.wait(RETRY_S)
 
-    def _publish_changed(self) -> None:
-        # Cleared before the states are read: later changes are published again.
-        with self._changed_lock:
-            names, self._changed_names = self._changed_names, set()
-        fault: Exception | None = None
+    def _try(self, name: str, work: Callable[[], object]) -> bool:
+        """Do background work; return whether it succeeded. Why it fails is reported, and it is tried again."""
         try:
-            for name in sorted(names):
-                item = self.store.read_state(name, Tasking.unpack, None)
-                if item is None:
-                    continue  # not committed yet, or it could not be read
-                try:
-                    self._publish_stored([self._archive.store_state(item)])
-                except ServiceStoppingError:
-                    raise
-                except Exception as error:  # noqa: BLE001 - the others are published
-                    fault = error
-                else:
-                    names.discard(name)
-        finally:
-            with self._changed_lock:
-                self._changed_names |= names
-        if fault is not None:
-            raise fault
+            work()
+        except ServiceStoppingError:
+            return True
+        except Exception as error:
+            if not isinstance(error, (OSError, SonarpostError)) and name not in self._background_faults:
+                log.exception("Background work failed after an unexpected exception")
+            self._background_faults[name] = f"{name}: {type(error).__name__}: {error}"
+            return False
+        self._background_faults.pop(name, None)
+        return True
 
-    def _background_fault(self, name: str, error: Exception) -> None:
-        """Report why a background thread fails; it tries again."""
-        if not isinstance(error, (OSError, SonarpostError)) and name not in self._background_faults:
-            log.error("Background work failed after an unexpected exception", exc_info=error)
-        self._background_faults[name] = f"{name}: {type(error).__name__}: {error}"
-
-    # Records of another c2
+    def _run_verification(self) -> None:
+        while not self.stopping.wait(VERIFICATION_INTERVAL_S):
+            self._try("verification", lambda: self._archive.verify(time.time(), VERIFICATION_INTERVAL_S))
 
     def _take_over(self) -> None:
         """Handle the records that another c2 has acknowledged and not handled before it ended."""
         while not self.stopping.wait(TAKE_OVER_INTERVAL_S):
-            try:
-                while taken := self._archive.take_over(self._store_taken):
-                    self.count("records_taken_over", taken)
-                    log.warning("Records of another c2 taken over", extra=kv(records=taken))
-                self._background_faults.pop("take-over", None)
-                self._prefer_others(others=False)
-            except Exception as error:  # noqa: BLE001 - reported
-                self._background_fault("take-over", error)
-                self._prefer_others(others=True)
+            self._prefer_others(others=not self._try("take-over", self._take_over_all))
 
     def _prefer_others(self, *, others: bool) -> None:
         """Leave records and queries to c2 that reach the database while there is one, or end that."""
         self.prefer_other_consumers(others=others)
         self._queries.set_preferred(is_preferred=not others)
+
+    def _take_over_all(self) -> None:
+        while taken := self._archive.take_over(self._store_taken):
+            self.count("records_taken_over", taken)
+            log.warning("Records of another c2 taken over", extra=kv(records=taken))
 
     def _store_taken(self, records: Sequence[tuple[str, bytes]]) -> None:
         with self.store.transaction() as tx:
@@ -488,7 +400,7 @@ class C2Service(Service[C2Config]):
         for each in self._inputs.values():
             each.close()
         self._retention.wake()
-        self._changed.set()
+        self._tasking.changed.set()
         self.decoding.close()
         self._codebooks.wake()
 
@@ -510,14 +422,6 @@ class C2Service(Service[C2Config]):
             self._queries.start(session)
             self.stopping.wait()
             self._queries.close()
-
-    def _run_verification(self) -> None:
-        while not self.stopping.wait(VERIFICATION_INTERVAL_S):
-            try:
-                self._archive.verify(time.time(), VERIFICATION_INTERVAL_S)
-                self._background_faults.pop("verification", None)
-            except Exception as error:  # noqa: BLE001 - reported
-                self._background_fault("verification", error)
 
     @override
     def warning(self) -> str:
