@@ -153,7 +153,8 @@ class Reception:
         effects = UnitOfWork()
         effects.quarantine(keys.acoustic_rx(self._vessel_id), packet.frames[0].data, reason)
         effects.count("frames_refused")
-        self._service.commit(effects)
+        with self._link.step():
+            self._service.commit(effects)
 
     def _process_packet(self, packet: PacketReceived, received_utc_s: float) -> None:
         if not packet.frames:

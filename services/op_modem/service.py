@@ -12,7 +12,6 @@ from typing_extensions import override
 from sonarpost import keys
 from sonarpost.config import PlatformConfig
 from sonarpost.delivery.queue_sender import QueuePolicy
-from sonarpost.delivery.records import InboxItem
 from sonarpost.delivery.store import Store
 from sonarpost.errors import PayloadError
 from sonarpost.link.auth.authentication import FrameAuthenticator
@@ -209,10 +208,9 @@ class OpModemService(Service[OpModemConfig]):
         self._transmitter.publish_states(self._changed_commands)
 
     @override
-    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
-        """Commit effects together with the changes of the endpoint."""
-        with self._link.step():
-            return super().commit_batch([*handled, (self._link.changes(), None)])
+    def further_effects(self) -> Sequence[UnitOfWork]:
+        """Return the changes of the endpoint; called in its step."""
+        return (self._link.changes(),)
 
     # Health
 

@@ -14,7 +14,6 @@ from typing_extensions import override
 
 from sonarpost import keys, wire
 from sonarpost.config import PlatformConfig
-from sonarpost.delivery.records import InboxItem
 from sonarpost.errors import BadInputError, DeliveryError, RetryLaterError
 from sonarpost.limits import limit
 from sonarpost.link.auth.key import Direction
@@ -70,7 +69,7 @@ class UuvModemService(Service[UuvModemConfig]):
     """
 
     NAME = "uuv_modem"
-    BATCH = 64
+    BATCH = MAX_AT_ONCE = 64
     PAGE_BYTES = 512
 
     def __init__(self, platform: PlatformConfig, config: UuvModemConfig) -> None:
@@ -177,11 +176,9 @@ class UuvModemService(Service[UuvModemConfig]):
         self._events.put(None)
 
     @override
-    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
-        """Commit effects together with the changes of the endpoint."""
-        with self._link.step() as endpoint:
-            changes = (endpoint.take_effects(), self._link.changes())
-            return super().commit_batch([*handled, *((effects, None) for effects in changes)])
+    def further_effects(self) -> Sequence[UnitOfWork]:
+        """Return the changes of the endpoint; called in its step."""
+        return (self._link.current.take_effects(), self._link.changes())
 
     # Events of the modem
 

@@ -121,20 +121,13 @@ def copy_store(source, target):
     return target / source.name
 
 
-def open_store(path):
-    """Open a store; commits need no flush, because only processes are killed here."""
-    store = Store(path)
-    store._db.execute("PRAGMA synchronous=OFF")
-    return store
-
-
 class Sending:
     """A producer: its store, its sender and what the test expects of it."""
 
     def __init__(self, path, network):
         path.parent.mkdir()
         self.network = network
-        self.store = open_store(path)
+        self.store = Store(path)
         self.sender = self._new_sender()
         self.backup = None
         self.was_restored = False
@@ -145,7 +138,7 @@ class Sending:
     def reopen(self, path):
         """Start with another copy of the store; what was in memory is lost."""
         self.store.close()
-        self.store = open_store(path)
+        self.store = Store(path)
         self.sender = self._new_sender()
 
     def queued(self):
@@ -174,7 +167,7 @@ class Delivery:
         self.hostile_keys = hostile_keys
         self.producers = [Sending(folder / f"producer-{n}" / "p.db", self.network) for n in range(len(producer_keys))]
         (folder / "consumer").mkdir()
-        self.store = open_store(folder / "consumer" / "c.db")
+        self.store = Store(folder / "consumer" / "c.db")
         self.refused = []
         self.handles_at_once = False
         self.inbox = self._new_inbox()
@@ -242,7 +235,7 @@ class Delivery:
     def kill_consumer(self):
         path = self._copy(self.store)
         self.store.close()
-        self.store = open_store(path)
+        self.store = Store(path)
         self.inbox = self._new_inbox()
 
     def receive(self, queries):

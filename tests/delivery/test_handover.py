@@ -178,8 +178,8 @@ def test_record_that_fails_while_others_are_handled_delays_and_harms_none(send, 
     commit = consumer.commit_batch
 
     def refuse(handled):
-        [(_, item)] = handled
-        name = str(wire.decode(Decision, item.payload, "").decision_id)
+        [effects] = handled
+        name = str(wire.decode(Decision, effects.payload, "").decision_id)
         if name in failing:
             raise failing[name]
         return commit(handled)

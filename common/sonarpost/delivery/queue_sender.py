@@ -431,7 +431,7 @@ class QueueSender:
         """Remove acknowledged records in one transaction; if repeated, the consumer discards them as duplicates."""
         if not self._acknowledged:
             return
-        with self._store.transaction() as tx:
+        with self._store.transaction(durable=False) as tx:
             tx.remove_acknowledged(self._queue, self._acknowledged)
             if self._on_acknowledged is not None:
                 for item in self._acknowledged.values():

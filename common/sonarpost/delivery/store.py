@@ -126,7 +126,6 @@ class Store:
             self._db.execute("PRAGMA journal_mode=WAL")
             page_bytes = int(self._db.execute("PRAGMA page_size").fetchone()[0])
             self._db.execute(f"PRAGMA wal_autocheckpoint={CHECKPOINT_BYTES // page_bytes}")
-            self._db.execute("PRAGMA synchronous=FULL")
             self._db.execute("PRAGMA foreign_keys=ON")
             # Some builds of SQLite overwrite deleted content, which writes every record to the disk a second time.
             self._db.execute("PRAGMA secure_delete=OFF")
@@ -161,8 +160,11 @@ class Store:
             self._watermark.start(self._db)
 
     @contextmanager
-    def transaction(self) -> Iterator[Transaction]:
-        """Open a write transaction: committed to the disk when the block ends, rolled back when it raises.
+    def transaction(self, *, durable: bool = True) -> Iterator[Transaction]:
+        """Open a write transaction: committed when the block ends, rolled back when it raises.
+
+        Args:
+            durable: Flush it to the disk; without, a power cut can undo it until the next durable one.
 
         Raises:
             DeliveryError: The database reported an error, for example a full disk; nothing was written.
@@ -171,6 +173,7 @@ class Store:
             tx = Transaction(self._db, self._in_flight)
             try:
                 # The connection commits at the end of its block, and rolls back after an exception.
+                self._db.execute(f"PRAGMA synchronous={'FULL' if durable else 'NORMAL'}")
                 with self._db:
                     self._db.execute("BEGIN IMMEDIATE")
                     yield tx

@@ -94,6 +94,10 @@ class UnitOfWork:
         """Store data that cannot be used, with the reason, in the store's `refused` table."""
         self._writes.append(lambda tx: tx.quarantine("in", key, payload, reason))
 
+    def remove_from_inbox(self, item: InboxItem) -> None:
+        """Remove the handled record from the inbox."""
+        self._writes.append(lambda tx: tx.remove_handled(item))
+
     def count(self, name: str, by: int = 1) -> None:
         """Increase a health counter when the unit of work is committed."""
         self.counts[name] += by

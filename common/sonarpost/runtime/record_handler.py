@@ -39,8 +39,8 @@ ALONE_AFTER: Final = limit(
 FAILURES_ALONE: Final = limit(
     3, "failures", "blame", "all services", "sender", "failures alone while others are handled", "it is quarantined"
 )
-MAX_DECODED, MAX_DECODED_BYTES = 2048, 4096
-"""Maximum number and size of the accepted records that are kept decoded until they are handled."""
+MAX_DECODED, MAX_DECODED_BYTES = 2048, 8 * 1024 * 1024
+"""Maximum number, and product of number and size, of the accepted records that are kept decoded until handled."""
 TYPES_KEPT = 1000
 """Maximum number of keys in the cache of record types."""
 MAX_REFUSAL_LOGS = 64
@@ -87,7 +87,8 @@ class RecordHandler:
 
     def keep_decoded(self, key: str, payload: bytes, record: Record) -> bool:
         """Keep an accepted record until it is handled in its turn; return False."""
-        if len(self._decoded) < MAX_DECODED and len(payload) <= MAX_DECODED_BYTES:
+        number = len(self._decoded) + 1
+        if number <= MAX_DECODED and number * len(payload) <= MAX_DECODED_BYTES:
             self._decoded[key, payload] = record
         return False
 
@@ -214,6 +215,7 @@ class RecordHandler:
                 yield tx, handle
                 if handled:
                     self._service.before_commit()
+                    handled.extend(self._service.further_effects())
                 for effects in handled:
                     effects.write(tx)
             if is_held and not tx.wrote_inbox:
@@ -227,29 +229,18 @@ class RecordHandler:
 
     def handle_batch(self, items: Sequence[InboxItem]) -> None:
         """Handle records of the inbox and commit what follows from them."""
+        handled: list[UnitOfWork] = []
         with self._service.handling():
-            self._handle_locked(items)
-
-    def _handle_locked(self, items: Sequence[InboxItem]) -> None:
-        if self._service.BATCH == 1:
-            for item in items:
-                self._handle_item(item)
-            return
-        handled: list[tuple[UnitOfWork, InboxItem]] = []
-        try:
-            for item in items:
-                effects = self._effects_of(item)
-                if effects is not None:
-                    handled.append((effects, item))
-        finally:
-            # Records before the one that has to be retried are complete.
-            if handled:
-                self._service.commit_batch(handled)
-
-    def _handle_item(self, item: InboxItem) -> None:
-        effects = self._effects_of(item)
-        if effects is not None:
-            self._service.commit_batch([(effects, item)])
+            try:
+                for item in items:
+                    effects = self._effects_of(item)
+                    if effects is not None:
+                        effects.remove_from_inbox(item)
+                        handled.append(effects)
+            finally:
+                # Records before the one that has to be retried are complete.
+                if handled:
+                    self._service.commit_batch(handled)
 
     def _effects_of(self, item: InboxItem) -> UnitOfWork | None:
         """Handle a record; return its effects, or None if it was quarantined."""

@@ -25,7 +25,7 @@ from sonarpost.delivery.disk_reserve import HANDLING_RESERVE_BYTES, DiskReserve
 from sonarpost.delivery.inbox import Inbox
 from sonarpost.delivery.outbox import Outbox
 from sonarpost.delivery.queue_sender import QueuePolicy
-from sonarpost.delivery.records import InboxItem, OutboxItem, platform_of
+from sonarpost.delivery.records import OutboxItem, platform_of
 from sonarpost.delivery.store import Store
 from sonarpost.delivery.transaction import Transaction, UnitOfWork
 from sonarpost.errors import DeliveryError
@@ -309,24 +309,18 @@ class Service(ABC, Generic[C]):
         with self._handler.handling(wait=wait) as is_held:
             yield is_held
 
-    def commit(self, effects: UnitOfWork, item: InboxItem | None = None) -> None:
-        """Write the effects and remove the record that caused them, in one transaction."""
-        self.commit_batch([(effects, item)])
+    def commit(self, effects: UnitOfWork) -> None:
+        """Write a unit of work in a transaction of its own."""
+        self.commit_batch([effects])
 
-    def commit_batch(self, handled: Sequence[tuple[UnitOfWork, InboxItem | None]]) -> int:
-        """Write the effects of several records and remove these records, in one transaction.
-
-        Returns:
-            Number of queued records that were replaced by newer editions.
-        """
+    def commit_batch(self, handled: Sequence[UnitOfWork]) -> None:
+        """Write several units of work in one transaction."""
         self.before_commit()
+        all_effects = [*handled, *self.further_effects()]
         with self.store.transaction() as tx:
-            for effects, item in handled:
+            for effects in all_effects:
                 effects.write(tx)
-                if item is not None:
-                    tx.remove_handled(item)
-        self.after_commit([effects for effects, _ in handled], tx.superseded)
-        return tx.superseded
+        self.after_commit(all_effects, tx.superseded)
 
     def before_commit(self) -> None:
         """Do what has to precede the commit of handled records; by default nothing.
@@ -334,6 +328,10 @@ class Service(ABC, Generic[C]):
         Raises:
             OSError, DeliveryError: The records are handled again.
         """
+
+    def further_effects(self) -> Sequence[UnitOfWork]:
+        """Return what is committed together with handled records; by default nothing."""
+        return ()
 
     def after_commit(self, handled: Sequence[UnitOfWork], superseded: int) -> None:
         """Count what was committed; a subclass extends it.
