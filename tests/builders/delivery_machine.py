@@ -87,6 +87,10 @@ class Network:
 class SteppedSender(QueueSender):
     """The product's sender; the test calls its parts in place of its thread."""
 
+    def __init__(self, network, store, queue):
+        super().__init__(network, store, queue, QueuePolicy(), lambda _tx, _item, _reason: None)
+        store.on_queued = lambda _, place: self.on_new(place)
+
     def _run(self):
         return
 
@@ -133,7 +137,7 @@ class Sending:
         self.was_restored = False
 
     def _new_sender(self):
-        return SteppedSender(self.network, self.store, CONSUMER, QueuePolicy(), None)
+        return SteppedSender(self.network, self.store, CONSUMER)
 
     def reopen(self, path):
         """Start with another copy of the store; what was in memory is lost."""

@@ -6,7 +6,6 @@ from builders.delivery_machine import Network, SteppedSender
 
 from sonarpost.delivery import queue_sender
 from sonarpost.delivery.protocol import MAX_BATCH_RECORDS, AckReply
-from sonarpost.delivery.queue_sender import QueuePolicy
 from sonarpost.delivery.records import Topic
 from sonarpost.errors import DeliveryError
 
@@ -34,7 +33,7 @@ def network():
 def sender(store, network, monkeypatch):
     monkeypatch.setattr(queue_sender, "IDLE_S", 0.0)
     monkeypatch.setattr(queue_sender, "BACK_OFF_S", (0.0,))
-    return SteppedSender(network, store, "c", QueuePolicy(), None)
+    return SteppedSender(network, store, "c")
 
 
 def queue(store, count, size_bytes=1000):

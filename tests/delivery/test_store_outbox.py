@@ -1,4 +1,4 @@
-"""Outbox of the durable store: consecutive numbers, priority order, quarantine, listeners."""
+"""Outbox of the durable store: consecutive numbers, priority order, quarantine, notification."""
 
 import hashlib
 
@@ -86,30 +86,18 @@ def test_records_of_one_sender_displace_none_of_another_from_the_quarantine(stor
     ]
 
 
-def test_listeners_are_notified_of_commits_only(store):
+def test_notification_of_commits_only(store):
     places = []
-    store.add_outbox_listener(places.append)
+    store.on_queued = lambda queue, place: places.append((queue, place))
     with pytest.raises(ZeroDivisionError):
         fail_within(store, lambda tx: (tx.send("k", "c", b"x", encoding="e"), tx.accept("k", b"x")))
     assert not places
     assert not store.inbox_changed.is_set()
     send(store, b"x")
-    assert places == [(4, 1)]
+    assert places == [("c", (4, 1))]
     assert not store.inbox_changed.is_set()
-    store.remove_outbox_listener(places.append)
     with store.transaction() as tx:
-        tx.send("k", "c", b"x", encoding="e")
+        tx.send("k", "other", b"x", encoding="e")
         tx.accept("k", b"x")
-    assert places == [(4, 1)]
+    assert places == [("c", (4, 1)), ("other", (4, 1))]
     assert store.inbox_changed.is_set()
-
-
-def test_listener_of_a_queue_replaces_the_general_one(store):
-    called = []
-    store.add_outbox_listener(lambda _: called.append("general"))
-    store.add_outbox_listener(lambda _: called.append("c2"), "c2")
-    for queues in (["c2"], ["relay"], ["c2", "relay"]):
-        with store.transaction() as tx:
-            for queue in queues:
-                tx.send("k", queue, b"x", encoding="e")
-    assert called == ["c2", "general", "c2", "general"]

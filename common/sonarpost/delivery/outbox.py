@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import zenoh
 
-from sonarpost.delivery.queue_sender import OnAcknowledged, QueuePolicy, QueueSender
+from sonarpost.delivery.queue_sender import FIRST_PLACE, OnAcknowledged, QueuePolicy, QueueSender
 from sonarpost.delivery.records import Place
 from sonarpost.delivery.store import Store
 from sonarpost.logs import kv
@@ -31,46 +31,34 @@ class Outbox:
         session: zenoh.Session,
         store: Store,
         *,
-        queue_policy: Callable[[str], QueuePolicy] | None = None,
-        on_acknowledged: OnAcknowledged | None = None,
+        queue_policy: Callable[[str], QueuePolicy] = lambda _: QueuePolicy(),
+        on_acknowledged: OnAcknowledged = lambda _tx, _item, _reason: None,
     ) -> None:
         self._session = session
         self._store = store
-        self._queue_policy = queue_policy or (lambda _: QueuePolicy())
+        self._queue_policy = queue_policy
         self._on_acknowledged = on_acknowledged
-        self._stop = threading.Event()
-        self._wake = threading.Event()
-        self._senders: dict[str, QueueSender] = {}
-        self._held: set[str] = set()
-        store.add_outbox_listener(self._on_new)
-        self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
-        self._thread.start()
+        self._lock = threading.Lock()
+        self._senders: dict[str, QueueSender | None] = {}  # None: the queue is held
+        store.on_queued = self._on_queued
+        for queue in store.queues():
+            self._on_queued(queue, FIRST_PLACE)
 
-    def _on_new(self, _place: Place) -> None:
-        self._wake.set()
+    def _on_queued(self, queue: str, place: Place) -> None:
+        """Start the sender of a queue when it first holds a record; tell it the place of a new one."""
+        with self._lock:
+            if queue not in self._senders and self._store.on_queued is not None:
+                self._senders[queue] = self._new_sender(queue)
+            sender = self._senders.get(queue)
+        if sender is not None:
+            sender.on_new(place)
 
-    def _run(self) -> None:
-        """Start a sender for each queue when it first holds a record."""
-        self._wake.set()
-        while not self._stop.is_set():
-            self._wake.wait()
-            self._wake.clear()
-            try:
-                for queue in self._store.queues():
-                    if queue not in self._senders and queue not in self._held and not self._stop.is_set():
-                        self._open(queue)
-            except Exception:
-                log.exception("Outbox cannot be read; retrying")
-                self._stop.wait(1.0)
-                self._wake.set()
-
-    def _open(self, queue: str) -> None:
+    def _new_sender(self, queue: str) -> QueueSender | None:
         policy = self._queue_policy(queue)
         if policy.held:
-            self._held.add(queue)
             log.warning("Records held for a consumer that is not configured", extra=kv(consumer=queue))
-            return
-        self._senders[queue] = QueueSender(self._session, self._store, queue, policy, self._on_acknowledged)
+            return None
+        return QueueSender(self._session, self._store, queue, policy, self._on_acknowledged)
 
     def is_responding(self, queue: str) -> bool:
         """Return whether a queue's consumer replied to the last query; False before the first one."""
@@ -84,14 +72,13 @@ class Outbox:
 
     def warning(self) -> str:
         """Return a warning if the store was restored from an older copy; empty if it was not."""
-        queues = ", ".join(queue for queue, sender in tuple(self._senders.items()) if sender.restored)
+        queues = ", ".join(queue for queue, sender in tuple(self._senders.items()) if sender and sender.restored)
         return f"{self._store.path.name} is older than its last delivery to {queues}" if queues else ""
 
     def close(self) -> None:
         """Stop sending; unacknowledged records stay in the store."""
-        self._stop.set()
-        self._wake.set()
-        self._thread.join()
-        self._store.remove_outbox_listener(self._on_new)
+        with self._lock:
+            self._store.on_queued = None  # no sender starts from now on
         for sender in self._senders.values():
-            sender.close()
+            if sender is not None:
+                sender.close()

@@ -113,7 +113,7 @@ class QueueSender:
         store: Store,
         queue: str,
         policy: QueuePolicy,
-        on_acknowledged: OnAcknowledged | None,
+        on_acknowledged: OnAcknowledged,
     ) -> None:
         self.responding = False
         self.acknowledged_count = 0
@@ -141,7 +141,6 @@ class QueueSender:
         self._wake = threading.Event()
         self._new_places: deque[Place] = deque([FIRST_PLACE])
         self._last_place, self._has_all = FIRST_PLACE, False
-        store.add_outbox_listener(self._on_new, queue)
         self._thread = threading.Thread(target=self._run, name=f"outbox-{queue}", daemon=True)
         self._thread.start()
 
@@ -150,9 +149,9 @@ class QueueSender:
         self._stop.set()
         self._wake.set()
         self._thread.join(timeout=0.5)
-        self._store.remove_outbox_listener(self._on_new, self._queue)
 
-    def _on_new(self, place: Place) -> None:
+    def on_new(self, place: Place) -> None:
+        """Use that a record was queued at a place."""
         self._new_places.append(place)
         self._wake.set()
 
@@ -413,7 +412,7 @@ class QueueSender:
     def _quarantine(self, transfer: RecordTransfer, reason: str) -> None:
         item = transfer.item
         with self._store.transaction() as tx:
-            replaced = self._on_acknowledged is not None and self._on_acknowledged(tx, item, reason)
+            replaced = self._on_acknowledged(tx, item, reason)
             if replaced:
                 tx.remove_acknowledged(item.queue, (item.seq,))
             else:
@@ -433,9 +432,8 @@ class QueueSender:
             return
         with self._store.transaction(durable=False) as tx:
             tx.remove_acknowledged(self._queue, self._acknowledged)
-            if self._on_acknowledged is not None:
-                for item in self._acknowledged.values():
-                    self._on_acknowledged(tx, item, None)
+            for item in self._acknowledged.values():
+                self._on_acknowledged(tx, item, None)
         self._clear(*self._acknowledged)
         self._acknowledged.clear()
 

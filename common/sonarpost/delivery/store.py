@@ -83,6 +83,7 @@ class Store:
         path: The SQLite file.
         origin: Random number of the store, 16 bytes; each queue has its own.
         inbox_changed: Set when a record was added to the inbox.
+        on_queued: Called after a transaction for each queue with new records, with the place of the first one.
         lost: Report of lost commits that no operator has cleared; None if there is none.
         states_discarded: Number of states that could not be read since the start; see `readable`.
 
@@ -100,7 +101,7 @@ class Store:
         self._page_bytes = page_bytes
         self._lock = threading.RLock()
         self._reader_lock = threading.Lock()
-        self._outbox_listeners: list[tuple[str, Callable[[Place], object]]] = []
+        self.on_queued: Callable[[str, Place], object] | None = None
         self._in_flight: set[tuple[str, int]] = set()
         self._watermark = Watermark(path)
         self.lost: LostRecords | None = None
@@ -183,24 +184,11 @@ class Store:
             except sqlite3.Error as error:
                 raise DeliveryError(f"{self.path}: {_reason(error, self.path)}") from error
             self.states_discarded += tx.states_discarded
-        listeners = tuple(self._outbox_listeners)
-        for queue, place in tx.first_places.items():
-            own = [on_new for name, on_new in listeners if name == queue]
-            for on_new in own or [on_new for name, on_new in listeners if not name]:
-                on_new(place)
+        if (on_queued := self.on_queued) is not None:
+            for queue, place in tx.first_places.items():
+                on_queued(queue, place)
         if tx.wrote_inbox:
             self.inbox_changed.set()
-
-    def add_outbox_listener(self, on_new: Callable[[Place], object], queue: str = "") -> None:
-        """Call `on_new` after each transaction that added a record to `queue`; by default to one without a listener.
-
-        Its argument is the place of the first new record.
-        """
-        self._outbox_listeners.append((queue, on_new))
-
-    def remove_outbox_listener(self, on_new: Callable[[Place], object], queue: str = "") -> None:
-        """Stop calling `on_new`."""
-        self._outbox_listeners.remove((queue, on_new))
 
     def _query(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
         """Query the writing connection, after the transaction in progress."""
