@@ -129,14 +129,9 @@ class AtomicFiles:
 
     def __init__(self) -> None:
         self._staged: list[_Staged] = []
-        self._texts: dict[Path, bytes] = {}
 
     def __len__(self) -> int:
         return len(self._staged)
-
-    def text_of(self, path: Path) -> bytes | None:
-        """Return the content of an uncommitted file that was added with `last`, or None."""
-        return self._texts.get(path)
 
     def add(self, path: Path, data: bytes, *, last: bool = False) -> None:
         """Write a temporary file for `path`.
@@ -157,14 +152,11 @@ class AtomicFiles:
         except BaseException:
             self.drop_from(len(self._staged) - 1)
             raise
-        if last:
-            self._texts[path] = data
 
     def drop_from(self, first: int) -> None:
         """Discard the files added from number `first` on."""
         dropped, self._staged = self._staged[first:], self._staged[:first]
         for staged in dropped:
-            self._texts.pop(staged.path, None)
             os.close(staged.descriptor)
             staged.temporary.unlink(missing_ok=True)
 

@@ -177,9 +177,7 @@ class CompressorService(Service[CompressorConfig]):
 
     def _expand(self, image_id: str, cached: CachedImage, effects: UnitOfWork) -> None:
         """Send more seabed around a contact as an image of its own; a repeated command sends the same image."""
-        expanded = self._cache.get(cached.expanded_id) if cached.expanded_id else None
-        if expanded is not None:
-            self._resend("resend", cached.expanded_id, expanded, effects)
+        if self._resend_derived(cached.expanded_id, effects):
             return
         snippet = expand(cached.snippet)
         if snippet is None:
@@ -193,11 +191,16 @@ class CompressorService(Service[CompressorConfig]):
         effects.count("images_expanded")
         log.info("Expanded image sent", extra=kv(image_id=image_id, expanded_id=expanded_id))
 
+    def _resend_derived(self, image_id: str, effects: UnitOfWork) -> bool:
+        """Send an image again that was made of another one; return False if none was made or it is not cached."""
+        cached = self._cache.get(image_id) if image_id else None
+        if cached is not None:
+            self._resend("resend", image_id, cached, effects)
+        return cached is not None
+
     def _send_original(self, image_id: str, cached: CachedImage, effects: UnitOfWork) -> None:
         """Send a contact without despeckling as an image of its own; a repeated command sends the same image."""
-        original = self._cache.get(cached.original_id) if cached.original_id else None
-        if original is not None:
-            self._resend("resend", cached.original_id, original, effects)
+        if self._resend_derived(cached.original_id, effects):
             return
         if not is_despeckled(cached.stream):
             effects.count("commands_without_despeckling")

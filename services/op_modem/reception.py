@@ -7,7 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 from pydantic import ValidationError
 
@@ -350,24 +350,14 @@ def status_record(
     status: StatusMessage, vessel_id: str, vehicle_id: str, received_utc_s: float, *, authenticated: bool
 ) -> ReceivedStatus:
     """Return the record of a received status."""
+    fields = asdict(status) | {"vehicle_id": vehicle_id, "time_utc_s": float(status.time_utc_s)}
+    if status.depth_m is not None:
+        fields["depth_m"] = min(12000.0, status.depth_m)
     return ReceivedStatus(
         vessel_id=vessel_id,
         vehicle_id=vehicle_id,
         received_utc_s=received_utc_s,
-        status=VehicleStatus(
-            vehicle_id=vehicle_id,
-            time_utc_s=float(status.time_utc_s),
-            lat_deg=status.lat_deg,
-            lon_deg=status.lon_deg,
-            heading_deg=status.heading_deg,
-            speed_mps=status.speed_mps,
-            depth_m=None if status.depth_m is None else min(12000.0, status.depth_m),
-            altitude_m=status.altitude_m,
-            swath_m=status.swath_m,
-            battery=status.battery,
-            images_waiting=status.images_waiting,
-            disk_free_bytes=status.disk_free_bytes,
-        ),
+        status=VehicleStatus(**fields),
         authenticated=authenticated,
     )
 

@@ -159,14 +159,12 @@ class VesselLink:
 
     def restore(self, parts: Parts) -> dict[str, FrameError]:
         """Replace the state by saved parts; return why parts were skipped. The state of another key is ignored."""
-        errors = {_LINK + name: error for name, error in self.endpoint.restore(below(_LINK, parts)).items()}
-        errors |= {_LIMITS + name: error for name, error in self.limiter.restore(below(_LIMITS, parts)).items()}
+        errors = prefixed(_LINK, self.endpoint.restore(below(_LINK, parts)))
+        errors |= prefixed(_LIMITS, self.limiter.restore(below(_LIMITS, parts)))
         if self.authenticator is not None:
-            skipped = self.authenticator.restore(below(_AUTHENTICATION, parts))
-            errors |= {_AUTHENTICATION + name: error for name, error in skipped.items()}
+            errors |= prefixed(_AUTHENTICATION, self.authenticator.restore(below(_AUTHENTICATION, parts)))
         if self._merger is not None:
-            skipped = self._merger.restore(below(_MERGING, parts))
-            errors |= {_MERGING + name: error for name, error in skipped.items()}
+            errors |= prefixed(_MERGING, self._merger.restore(below(_MERGING, parts)))
         return errors
 
 

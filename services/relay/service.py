@@ -16,7 +16,7 @@ from sonarpost import keys, wire
 from sonarpost.archive import image_parts
 from sonarpost.bus.connectivity import MonitoredSite, SiteMonitor
 from sonarpost.bus.session import open_with_retry
-from sonarpost.config import PlatformConfig, TlsConfig
+from sonarpost.config import PlatformConfig
 from sonarpost.delivery.disk_reserve import DiskReserve
 from sonarpost.delivery.queue_sender import QueuePolicy
 from sonarpost.delivery.records import OutboxItem, Topic, consumer_of, queue_of
@@ -60,14 +60,16 @@ class Upstream:
 
     Args:
         options: Configuration of the site.
-        tls: The host's own certificate.
+        platform: The vessel.
     """
 
-    def __init__(self, options: UpstreamOptions, tls: TlsConfig | None) -> None:
+    def __init__(self, options: UpstreamOptions, platform: PlatformConfig) -> None:
         self.options = options
+        self.inbox = keys.shore_inbox(platform.id, options.site)
+        self.part_key = keys.shore_part(platform.id, options.site)
         # The queue of the default site has no site in its name.
         self.queue = CONSUMER if options.site == keys.SHORE else queue_of(CONSUMER, options.site)
-        self._tls = tls
+        self._tls = platform.tls
         self._session: zenoh.Session | None = None
         self._lock = threading.Lock()
 
@@ -113,13 +115,9 @@ class RelayService(Service[RelayConfig]):
 
     def __init__(self, platform: PlatformConfig, config: RelayConfig) -> None:
         super().__init__(platform, config)
-        upstreams = [Upstream(site, platform.tls) for site in config.sites()]
+        upstreams = [Upstream(site, platform) for site in config.sites()]
         self._upstreams = {upstream.queue: upstream for upstream in upstreams}
-        self._part_keys = {
-            upstream.queue: keys.shore_part(platform.id, upstream.options.site) for upstream in upstreams
-        }
         self._stored_versions = Counter[str]()
-        self._inboxes = {upstream.queue: keys.shore_inbox(platform.id, upstream.options.site) for upstream in upstreams}
         sites = [self._monitored(upstream) for upstream in upstreams]
         self._site_monitor = SiteMonitor(platform.id, sites, platform.tls)
         radio = {upstream.options.site for upstream in upstreams}
@@ -191,7 +189,10 @@ class RelayService(Service[RelayConfig]):
                 effects.send_payload(key, consumer, effects.payload, Command, priority=COMMAND_PRIORITY)
             effects.count("commands_taken")
         elif isinstance(record, ReceivedStatus):
-            self._queue_status(key, record, effects)
+            # It replaces older ones of the vehicle.
+            topic = Topic(f"status/{record.vehicle_id}", int(1000 * record.received_utc_s))
+            self._queue_relayed(key, effects, STATUS_PRIORITY, topic)
+            effects.count("statuses_relayed")
         else:
             assert isinstance(record, (CodedImage, Decision))
             for added in self._added:
@@ -199,11 +200,12 @@ class RelayService(Service[RelayConfig]):
             if isinstance(record, CodedImage):
                 self._queue_image(record, effects)
             else:
-                self._queue_decision(key, effects)
+                self._queue_relayed(key, effects, DECISION_PRIORITY)
+                effects.count("decisions_relayed")
+                log.debug("Record queued for the shore", extra=kv(record=Decision.TYPE, sites=len(self._upstreams)))
 
-    def _withdraw(self, item: OutboxItem) -> None:
-        """Withdraw from other bearers a record that the radio has delivered."""
-        site = self._upstreams[item.queue].options.site
+    def _withdraw(self, item: OutboxItem, site: str) -> None:
+        """Withdraw from other bearers a record that the radio has delivered to a site."""
         fields = wire.unpack_map(item.payload, item.key)
         if isinstance(payload := fields.get("payload"), bytes):
             fields = wire.unpack_map(payload, item.key)  # an envelope
@@ -213,23 +215,12 @@ class RelayService(Service[RelayConfig]):
             if added.site == site:
                 added.delivered_by_radio(fields)
 
-    def _queue_status(self, key: str, record: ReceivedStatus, effects: UnitOfWork) -> None:
-        """Queue a status for each site; it replaces older ones of the vehicle."""
-        envelope = Relayed(vessel_id=self.platform.id, key=key, payload=effects.payload, relayed_utc_s=time.time())
-        topic = Topic(f"status/{record.vehicle_id}", int(1000 * record.received_utc_s))
-        payload = wire.encode(envelope)
-        for queue, inbox in self._inboxes.items():
-            effects.send_payload(inbox, queue, payload, Relayed, priority=STATUS_PRIORITY, topic=topic)
-        effects.count("statuses_relayed")
-
-    def _queue_decision(self, key: str, effects: UnitOfWork) -> None:
+    def _queue_relayed(self, key: str, effects: UnitOfWork, priority: int, topic: Topic | None = None) -> None:
+        """Queue the handled record for each site, in an envelope."""
         envelope = Relayed(vessel_id=self.platform.id, key=key, payload=effects.payload, relayed_utc_s=time.time())
         payload = wire.encode(envelope)
-        for queue, inbox in self._inboxes.items():
-            effects.send_payload(inbox, queue, payload, Relayed, priority=DECISION_PRIORITY)
-        effects.count("decisions_relayed")
-        if log.isEnabledFor(logging.DEBUG):
-            log.debug("Record queued for the shore", extra=kv(record=Decision.TYPE, sites=len(self._upstreams)))
+        for upstream in self._upstreams.values():
+            effects.send_payload(upstream.inbox, upstream.queue, payload, Relayed, priority=priority, topic=topic)
 
     def _queue_image(self, image: CodedImage, effects: UnitOfWork) -> None:
         """Queue for each site the difference to the version that it has acknowledged last, or the whole image."""
@@ -238,7 +229,7 @@ class RelayService(Service[RelayConfig]):
         priority = PREVIEW_PRIORITY if image.version == 1 else DETAIL_PRIORITY
         topic = topic_of(image)
         replaces = topic if self.config.supersede else None
-        for queue, key in self._part_keys.items():
+        for queue, upstream in self._upstreams.items():
             known = None
             if image.version > 1:
                 name = f"{VERSIONS}{queue}/{topic.name}"
@@ -249,19 +240,19 @@ class RelayService(Service[RelayConfig]):
             if is_difference:
                 # The site may have another version by then, and so may this relay.
                 effects.put_state(f"{WHOLES}{queue}/{topic.name}/{image.version}", payload)
-            effects.send_payload(key, queue, sent, ImagePart, priority=priority, topic=replaces)
+            effects.send_payload(upstream.part_key, queue, sent, ImagePart, priority=priority, topic=replaces)
             effects.count("image_differences", int(is_difference))
         effects.count("image_bytes_received", image.bytes_received)
         effects.count("coded_images_relayed")
-        if log.isEnabledFor(logging.DEBUG):
-            log.debug("Image queued for the shore", extra=kv(version=image.version, bytes=len(payload)))
+        log.debug("Image queued for the shore", extra=kv(version=image.version, bytes=len(payload)))
 
     @override
     def on_acknowledged(self, tx: Transaction, item: OutboxItem, reason: str | None) -> bool:
         """Store which version of an image a site has; send the whole image if the site has refused a difference."""
-        if self._added and reason is None and item.queue in self._upstreams:
-            self._withdraw(item)
-        if item.key != self._part_keys.get(item.queue):
+        upstream = self._upstreams.get(item.queue)
+        if self._added and reason is None and upstream is not None:
+            self._withdraw(item, upstream.options.site)
+        if upstream is None or item.key != upstream.part_key:
             return False
         part = image_parts.head_of(item.payload)
         name = f"{VERSIONS}{item.queue}/{part.subject}"

@@ -68,16 +68,9 @@ class StatusBeacon:
         """
         with self._lock:
             status = self._status or VehicleStatus(vehicle_id=self._vehicle_id, time_utc_s=now)
-        return StatusMessage(
-            time_utc_s=min(_LAST_TIME_UTC_S, int(status.time_utc_s)),
-            lat_deg=status.lat_deg,
-            lon_deg=status.lon_deg,
-            heading_deg=status.heading_deg,
-            speed_mps=status.speed_mps,
-            depth_m=status.depth_m,
-            altitude_m=status.altitude_m,
-            swath_m=status.swath_m,
-            battery=status.battery,
-            images_waiting=images_waiting,
-            disk_free_bytes=disk_free_bytes,
-        )
+        fields = status.model_dump(exclude={"vehicle_id"}) | {
+            "time_utc_s": min(_LAST_TIME_UTC_S, int(status.time_utc_s)),
+            "images_waiting": images_waiting,
+            "disk_free_bytes": disk_free_bytes,
+        }
+        return StatusMessage(**fields)

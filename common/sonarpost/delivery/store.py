@@ -355,19 +355,6 @@ class Store:
         )
         return {str(name).removeprefix(prefix): bytes(value) for name, value in found}
 
-    def states_after(self, prefix: str, after: str, limit: int) -> list[tuple[str, bytes]]:
-        """Return the first values whose names start with `prefix` and are above `after`, in order of their names."""
-        found = self._read(
-            "SELECT name, value FROM state WHERE name > ? AND name < ? ORDER BY name LIMIT ?",
-            (after, prefix + "\U0010ffff", limit),
-        )
-        return [(str(name), bytes(value)) for name, value in found]
-
-    def state_count(self, prefix: str) -> int:
-        """Return the number of values whose names start with `prefix`."""
-        args = (prefix, prefix + "\U0010ffff")
-        return self._read_int("SELECT COUNT(*) FROM state WHERE name >= ? AND name < ?", args)
-
     def read_state(self, name: str, parse: Callable[[bytes], T], otherwise: D) -> T | D:
         """Parse the value under `name`; return `otherwise` if there is none or it is discarded. See `readable`."""
         value = self.get_state(name)

@@ -371,11 +371,6 @@ class Service(ABC, Generic[C]):
 
     # Health
 
-    @property
-    def started_utc_s(self) -> float:
-        """Start of the service, UTC in seconds."""
-        return self._health.started_utc_s
-
     def count(self, name: str, by: int = 1) -> None:
         """Increase a health counter."""
         self._health.count(name, by)

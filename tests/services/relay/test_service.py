@@ -39,7 +39,7 @@ def test_decision_is_relayed_unchanged_in_an_envelope_and_an_image_as_part(begin
     envelope, part = shore.received
     assert (envelope.vessel_id, envelope.key) == ("vessel-1", DECISIONS)
     assert envelope.payload == wire.encode(decision_record())
-    assert envelope.relayed_utc_s >= service.started_utc_s
+    assert envelope.relayed_utc_s >= service.health().started_utc_s
     assert part == whole_part(image())
     eventually(lambda: service.health().gauges["waiting_for_shore"] == 0.0)
     counters = service.health().counters
