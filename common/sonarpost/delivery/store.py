@@ -1,8 +1,8 @@
 """Durable store of one service: accepted records, queued records and state in one SQLite file.
 
-The file uses WAL and synchronous=FULL. A received record is committed to `inbox` before it is acknowledged. Handling a
-record removes it from the inbox, adds new records to `outbox` and changes `state` in **one** transaction. A process
-that is killed at any moment therefore neither loses nor duplicates a record.
+The file uses WAL and synchronous=FULL, except to delete acknowledged records. A received record is committed to `inbox`
+before it is acknowledged. Handling a record removes it from the inbox, adds new records to `outbox` and changes `state`
+in **one** transaction. A process that is killed at any moment therefore neither loses nor duplicates a record.
 """
 
 from __future__ import annotations
