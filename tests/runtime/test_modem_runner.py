@@ -5,6 +5,7 @@ import queue
 import threading
 import time
 import tty
+from types import SimpleNamespace
 
 import pytest
 from builders.common import WAIT_S, eventually
@@ -32,6 +33,7 @@ from sonarpost.modem.micromodem import (
 from sonarpost.modem.registry import ModemSettings
 from sonarpost.modem.udp import UdpModem
 from sonarpost.modem.udp.datagram import Datagram, DatagramKind
+from sonarpost.runtime import modem_runner, serial_port
 from sonarpost.runtime.modem_runner import MAX_INPUTS, ModemRunner
 from sonarpost.runtime.serial_port import ModemPort, PortOpened, SerialPort
 
@@ -105,7 +107,7 @@ class Rig:
     def __init__(self, modem):
         self.modem = modem
         self.events: list[ModemEvent] = []
-        self.port = SerialPort(str(modem.path), first_retry_s=0.02, max_retry_s=0.1)
+        self.port = SerialPort(str(modem.path))
         self.runner = ModemRunner(MicroModem(CONFIG), self.port, self.events.append)
 
     def of(self, *kinds):
@@ -113,7 +115,9 @@ class Rig:
 
 
 @pytest.fixture
-def rig(tmp_path):
+def rig(tmp_path, monkeypatch):
+    monkeypatch.setattr(serial_port, "FIRST_RETRY_S", 0.02)
+    monkeypatch.setattr(serial_port, "MAX_RETRY_S", 0.1)
     modem = PtyModem(tmp_path / "ttyMODEM")
     rig = Rig(modem)
     rig.runner.start()
@@ -217,18 +221,14 @@ def test_stop_reports_the_packet_that_failed(tmp_path):
     modem.unplug()
 
 
-def test_timers_run_without_a_byte_from_the_port(tmp_path):
+def test_timers_run_without_a_byte_from_the_port(tmp_path, monkeypatch):
     """With a clock fifty times faster, a command without a reply is repeated."""
+    monkeypatch.setattr(modem_runner, "time", SimpleNamespace(monotonic=lambda: 50.0 * time.monotonic()))
+    monkeypatch.setattr(modem_runner, "_MAX_WAIT_S", 0.02)
     modem = PtyModem(tmp_path / "ttyMODEM")
     modem.replies = False
     events: list[ModemEvent] = []
-    runner = ModemRunner(
-        MicroModem(CONFIG),
-        SerialPort(str(modem.path)),
-        events.append,
-        clock=lambda: 50.0 * time.monotonic(),
-        max_wait_s=0.02,
-    )
+    runner = ModemRunner(MicroModem(CONFIG), SerialPort(str(modem.path)), events.append)
     runner.start()
     eventually(lambda: events)
     runner.stop()

@@ -76,12 +76,20 @@ def server():
         yield listening
 
 
-def make_port(url, **options):
-    return SerialPort(url, first_retry_s=0.02, max_retry_s=0.1, **options)
+@pytest.fixture(autouse=True)
+def retries(monkeypatch):
+    """Sets the delays after failed attempts to open; at first short ones."""
+
+    def change(first_s, max_s):
+        monkeypatch.setattr(serial_port, "FIRST_RETRY_S", first_s)
+        monkeypatch.setattr(serial_port, "MAX_RETRY_S", max_s)
+
+    change(0.02, 0.1)
+    return change
 
 
 def test_a_pty_transfers_bytes_in_both_directions(pty_port):
-    port = make_port(str(pty_port.path))
+    port = SerialPort(str(pty_port.path))
     events = PortEvents(port)
     try:
         assert events.next() == PortOpened()
@@ -105,7 +113,7 @@ def test_an_unplugged_pty_is_reported_and_opened_again(pty_port, caplog, monkeyp
     attempts: list[str] = []
     make = serial.serial_for_url
     monkeypatch.setattr(serial, "serial_for_url", lambda url, **options: attempts.append(url) or make(url, **options))
-    port = make_port(str(pty_port.path))
+    port = SerialPort(str(pty_port.path))
     events = PortEvents(port)
     try:
         for round_number in range(3):
@@ -139,7 +147,7 @@ def test_an_unplugged_pty_is_reported_and_opened_again(pty_port, caplog, monkeyp
 @pytest.mark.parametrize("reset", [False, True], ids=["end of stream", "reset"])
 def test_a_socket_is_opened_again_after_it_was_closed(server, reset):
     host, number = server.getsockname()
-    port = make_port(f"socket://{host}:{number}")
+    port = SerialPort(f"socket://{host}:{number}")
     events = PortEvents(port)
     try:
         for _ in range(2):
@@ -160,7 +168,7 @@ def test_a_socket_is_opened_again_after_it_was_closed(server, reset):
 
 def test_an_absent_server_is_retried(caplog):
     number = free_port()
-    port = make_port(f"socket://127.0.0.1:{number}")
+    port = SerialPort(f"socket://127.0.0.1:{number}")
     events = PortEvents(port)
     try:
         eventually(lambda: port.error is not None)
@@ -172,7 +180,7 @@ def test_an_absent_server_is_retried(caplog):
         port.close()
 
 
-def test_retries_slow_down_when_the_server_closes_each_connection(server, monkeypatch):
+def test_retries_slow_down_when_the_server_closes_each_connection(server, retries, monkeypatch):
     waits: list[float | None] = []
 
     class QuickEvent(threading.Event):
@@ -182,7 +190,8 @@ def test_retries_slow_down_when_the_server_closes_each_connection(server, monkey
 
     quick = SimpleNamespace(**(vars(threading) | {"Event": QuickEvent}))
     host, number = server.getsockname()
-    port = SerialPort(f"socket://{host}:{number}", first_retry_s=1000.0, max_retry_s=3000.0)
+    retries(1000.0, 3000.0)
+    port = SerialPort(f"socket://{host}:{number}")
     monkeypatch.setattr(serial_port, "threading", quick)
     port.start(lambda event: None)
     while len(waits) < 3:
@@ -191,9 +200,10 @@ def test_retries_slow_down_when_the_server_closes_each_connection(server, monkey
     assert waits[:3] == [2000.0, 3000.0, 3000.0]
 
 
-def test_a_blocked_write_ends_with_an_error(server):
+def test_a_blocked_write_ends_with_an_error(server, monkeypatch):
+    monkeypatch.setattr(serial_port, "WRITE_TIMEOUT_S", 0.3)
     host, number = server.getsockname()
-    port = make_port(f"socket://{host}:{number}", write_timeout_s=0.3)
+    port = SerialPort(f"socket://{host}:{number}")
     events = PortEvents(port)
     try:
         assert events.next() == PortOpened()
@@ -207,7 +217,7 @@ def test_a_blocked_write_ends_with_an_error(server):
 
 
 def test_a_loop_url_works_without_a_descriptor():
-    port = make_port("loop://")
+    port = SerialPort("loop://")
     events = PortEvents(port)
     try:
         assert events.next() == PortOpened()
@@ -218,10 +228,11 @@ def test_a_loop_url_works_without_a_descriptor():
 
 
 @pytest.mark.parametrize("state", ["open", "opening"])
-def test_close_does_not_wait_for_a_retry_and_stops_events(pty_port, state):
+def test_close_does_not_wait_for_a_retry_and_stops_events(pty_port, retries, state):
+    retries(3600.0, 3600.0)
     if state == "opening":
         pty_port.unplug()
-    port = SerialPort(str(pty_port.path), first_retry_s=3600.0, max_retry_s=3600.0)
+    port = SerialPort(str(pty_port.path))
     events = PortEvents(port)
     if state == "open":
         assert events.next() == PortOpened()
@@ -234,7 +245,7 @@ def test_close_does_not_wait_for_a_retry_and_stops_events(pty_port, state):
 
 
 def test_a_closed_port_can_be_started_again(pty_port):
-    port = make_port(str(pty_port.path))
+    port = SerialPort(str(pty_port.path))
     for _ in range(3):
         events = PortEvents(port)
         assert events.next() == PortOpened()
@@ -286,7 +297,7 @@ def test_second_program_is_refused_and_the_first_keeps_its_bytes(pty_port, first
 
 
 def test_port_in_use_is_retried_and_opened_when_it_is_free(pty_port, first, caplog):
-    port = make_port(str(pty_port.path))
+    port = SerialPort(str(pty_port.path))
     events = PortEvents(port)
     with closing(port):
         eventually(lambda: port.error is not None)
@@ -302,7 +313,7 @@ def test_port_in_use_is_retried_and_opened_when_it_is_free(pty_port, first, capl
 
 def test_each_reason_of_a_port_that_is_not_open_is_logged_once(pty_port, first, caplog):
     link = pty_port.path.with_name("adapter")
-    port = make_port(str(link))
+    port = SerialPort(str(link))
     events = PortEvents(port)
     with closing(port):
         eventually(lambda: port.error is not None)

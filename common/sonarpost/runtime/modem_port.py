@@ -30,6 +30,7 @@ UDP_SCHEME: Final = "udp://"
 _READ_BYTES: Final = 8192
 """Longer datagrams are cut, and refused by the driver: its format has at most 4096 bytes."""
 _POLL_S: Final = 0.2
+_RETRY_S: Final = 1.0
 _ANY: Final = "0.0.0.0"  # noqa: S104 - datagrams of a multicast group arrive on any interface
 
 
@@ -51,7 +52,6 @@ class UdpPort(ModemPort):
 
     Args:
         url: See the module.
-        retry_s: Delay after a failed attempt to open.
 
     Raises:
         ConfigError: Not a multicast address of IPv4, or an unknown option.
@@ -59,9 +59,8 @@ class UdpPort(ModemPort):
 
     STREAM: ClassVar[bool] = False
 
-    def __init__(self, url: str, *, retry_s: float = 1.0) -> None:
+    def __init__(self, url: str) -> None:
         super().__init__(url)
-        self._retry_s = retry_s
         self._group, self._interface, self._ttl = _parse(url)
         self._port: socket.socket | None = None
 
@@ -90,7 +89,7 @@ class UdpPort(ModemPort):
                 log.warning("Port lost", extra=kv(port=self.url, reason=self._error))
                 if was_open:
                     on_event(PortLost(self._error))
-                closing.wait(self._retry_s)
+                closing.wait(_RETRY_S)
         self._port, self._error = None, "closed"
 
     def _open(self) -> socket.socket:

@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 _STOP_S = 1.0
 _RETRY_S = 1.0
 _POLL_S = 0.2
+_MAX_WAIT_S = 0.25
+"""Maximum time between two polls of the timers."""
 MAX_INPUTS: Final = limit(
     256, "inputs", "claims", "modem port", "modem or network", "received parts waiting", "the port is not read further"
 )
@@ -34,8 +36,6 @@ class ModemRunner:
         port: The port, not started.
         on_event: Called with each event, in order, in the runner's thread and without a lock, so it may call
             `send_packet`. An exception from it is logged and loses that event only.
-        clock: Monotonic time in seconds.
-        max_wait_s: Maximum time between two polls of the timers, for clocks that run fast.
 
     Attributes:
         failures: Number of inputs after which the driver raised an unexpected exception. They are skipped.
@@ -47,15 +47,10 @@ class ModemRunner:
         driver: Modem,
         port: ModemPort,
         on_event: Callable[[ModemEvent], None],
-        clock: Callable[[], float] = time.monotonic,
-        *,
-        max_wait_s: float = 0.25,
     ) -> None:
         self._driver = driver
         self._port = port
         self._on_event = on_event
-        self._clock = clock
-        self._max_wait_s = max_wait_s
         self._lock = threading.Lock()
         self._inputs: queue.Queue[PortEvent | None] = queue.Queue(MAX_INPUTS)
         self.failures = 0
@@ -143,7 +138,7 @@ class ModemRunner:
             request: Receives the driver and the monotonic time, and returns the number of the request.
         """
         with self._lock:
-            number = request(self._driver, self._clock())
+            number = request(self._driver, time.monotonic())
         self._wake()
         return number
 
@@ -168,16 +163,16 @@ class ModemRunner:
                 log.exception("Modem driver failed; skipping its input", extra=kv(port=self._port.url))
                 self._stopping.wait(_RETRY_S)
         with self._lock:
-            self._driver.port_lost(self._clock())
-            events = self._driver.poll(self._clock())
+            self._driver.port_lost(time.monotonic())
+            events = self._driver.poll(time.monotonic())
         self._deliver(events)
 
     def _wait(self) -> PortEvent | None:
         with self._lock:
             wakeup_s = self._driver.next_wakeup()
-        wait_s = self._max_wait_s
+        wait_s = _MAX_WAIT_S
         if wakeup_s is not None:
-            wait_s = min(max(0.0, wakeup_s - self._clock()), wait_s)
+            wait_s = min(max(0.0, wakeup_s - time.monotonic()), wait_s)
         try:
             return self._inputs.get(timeout=wait_s)
         except queue.Empty:
@@ -185,7 +180,7 @@ class ModemRunner:
 
     def _step(self, item: PortEvent | None) -> None:
         with self._lock:
-            now = self._clock()
+            now = time.monotonic()
             events = self._apply(item, now)
             events += self._driver.poll(now)
             parts = list(iter(self._driver.bytes_to_send, b""))

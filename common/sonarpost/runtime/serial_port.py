@@ -31,6 +31,10 @@ log = logging.getLogger(__name__)
 _READ_BYTES = 4096
 _POLL_S = 0.2
 _CLOSE_S = 1.0
+FIRST_RETRY_S, MAX_RETRY_S = 0.2, 5.0
+"""Delay after the first failed attempt to open, which doubles with each attempt, and its maximum."""
+WRITE_TIMEOUT_S = 5.0
+"""A write that takes longer counts as a lost port."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,28 +138,14 @@ class SerialPort(ModemPort):
     Args:
         url: `/dev/ttyUSB0`, `/dev/pts/3`, `socket://host:port`, `rfc2217://host:port`, `loop://`.
         baud: Bits a second; 8N1 without flow control, as the Micro-Modem is set.
-        first_retry_s: Delay after the first failed attempt to open. It doubles with each attempt.
-        max_retry_s: Maximum delay between attempts.
-        write_timeout_s: A write that takes longer counts as a lost port.
 
     Raises:
         ConfigError: pyserial does not support this kind of URL.
     """
 
-    def __init__(
-        self,
-        url: str,
-        baud: int = 19200,
-        *,
-        first_retry_s: float = 0.2,
-        max_retry_s: float = 5.0,
-        write_timeout_s: float = 5.0,
-    ) -> None:
+    def __init__(self, url: str, baud: int = 19200) -> None:
         super().__init__(url)
         self.baud = baud
-        self._first_retry_s = first_retry_s
-        self._max_retry_s = max_retry_s
-        self._write_timeout_s = write_timeout_s
         # Held while writing and while closing: a closed descriptor may be reused by another file at once.
         self._in_use = threading.Lock()
         self._port: serial.Serial | None = None
@@ -176,7 +166,7 @@ class SerialPort(ModemPort):
 
     @override
     def _run(self, on_event: Callable[[PortEvent], None], closing: threading.Event) -> None:
-        wait_s = self._first_retry_s
+        wait_s = FIRST_RETRY_S
         while not closing.is_set():
             port = self._open(closing)
             if port is None:
@@ -189,13 +179,13 @@ class SerialPort(ModemPort):
                 log.warning("Port lost", extra=kv(port=self.url, reason=self._error))
                 on_event(PortLost(self._error or reason))
             # A port that is lost at once after opening (a server without free connections) is retried more slowly.
-            was_stable = time.monotonic() - opened_s > self._max_retry_s
-            wait_s = self._first_retry_s if was_stable else min(2.0 * wait_s, self._max_retry_s)
+            was_stable = time.monotonic() - opened_s > MAX_RETRY_S
+            wait_s = FIRST_RETRY_S if was_stable else min(2.0 * wait_s, MAX_RETRY_S)
             closing.wait(wait_s)
 
     def _open(self, closing: threading.Event) -> serial.Serial | None:
         """Retry until the port is open; return None if it is closed before."""
-        wait_s, logged = self._first_retry_s, ""
+        wait_s, logged = FIRST_RETRY_S, ""
         while not closing.is_set():
             port = self._make_port()
             try:
@@ -209,7 +199,7 @@ class SerialPort(ModemPort):
                     log.warning("Port cannot be opened; retrying", extra=kv(port=self.url, reason=self._error))
                     logged = self._error
                 closing.wait(wait_s)
-                wait_s = min(2.0 * wait_s, self._max_retry_s)
+                wait_s = min(2.0 * wait_s, MAX_RETRY_S)
                 continue
             self._port, self._error = port, None
             log.info("Port open", extra=kv(port=self.url))
@@ -246,7 +236,7 @@ class SerialPort(ModemPort):
     def _make_port(self) -> serial.Serial:
         try:
             return serial.serial_for_url(
-                self.url, baudrate=self.baud, timeout=_POLL_S, write_timeout=self._write_timeout_s, do_not_open=True
+                self.url, baudrate=self.baud, timeout=_POLL_S, write_timeout=WRITE_TIMEOUT_S, do_not_open=True
             )
         except ValueError as error:
             expected = "a device path or socket://, rfc2217://, loop://"
