@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builders.xtf import write_xtf
+from builders.survey_lines import line
+from builders.surveys import jsf_message
+from pyproj import Transformer
 
 import sonarpost
-from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.sonar.readers import read_survey
+from sonarpost.sonar.survey import Side
 
 HEAVY = ("numba", "numpy", "scipy", "pydantic", "zenoh", "serial", "PIL")
 
@@ -58,20 +59,32 @@ def test_three_lines_encode_and_decode_an_image():
         assert sonarpost.decode(sonarpost.encode(image, codec="vq", codebook=codebook)).shape == image.shape
 
 
+def line_in_metres(path):
+    """Write a recording with one object, whose positions are centimetres of EPSG:32619."""
+    to_metres = Transformer.from_crs("EPSG:4326", "EPSG:32619", always_xy=True)
+    with path.open("wb") as file:
+        for ping in line(bright=None):
+            easting_m, northing_m = to_metres.transform(ping.lon_deg, ping.lat_deg)
+            place = {"unit": 4, "x": round(easting_m * 100), "y": round(northing_m * 100)}
+            for number, side in enumerate(Side):
+                samples = ping.channel(side).samples.astype(np.uint16)
+                if side is Side.PORT and 57 <= ping.number <= 63:
+                    samples[400:410], samples[410:450] = 255, 1  # highlight and shadow
+                values = {"altitude": 6000, "heading": 3000, "interval_ns": 66_667}
+                file.write(jsf_message(ping.number, 20, number, samples, **place, **values))
+
+
 def test_a_survey_in_metres_is_opened_and_searched_for_contacts_with_its_projection(tmp_path):
-    survey = simulate_survey(SurveySpec(seed=1, pings=200, samples=512, clutter=0)).survey
-    write_xtf(survey, tmp_path / "line.xtf", projected_crs="EPSG:32630")
-    options = sonarpost.SurveyOptions(projected_crs="EPSG:32630")
-    with sonarpost.open_survey(str(tmp_path / "line.xtf"), options) as source:
-        contacts = sonarpost.detect(source)
+    line_in_metres(tmp_path / "line.jsf")
+    options = sonarpost.SurveyOptions(projected_crs="EPSG:32619")
+    with sonarpost.open_survey(str(tmp_path / "line.jsf"), options) as source:
+        contact = sonarpost.detect(source)[0]
         assert source.info.grid is not None
-    assert contacts
-    for contact in contacts:
-        assert contact.position is not None
-        assert (contact.position.lat_deg, contact.position.lon_deg) == pytest.approx((56.45, -5.6), abs=0.002)
-    with sonarpost.open_survey(tmp_path / "line.xtf") as source:
+    assert (contact.side, contact.ping_index) == (Side.PORT, 60)
+    assert (contact.position.lat_deg, contact.position.lon_deg) == pytest.approx((48.4, -68.8), abs=0.001)
+    with sonarpost.open_survey(tmp_path / "line.jsf") as source:
         assert "set the option projected_crs" in source.info.warnings[0]
-    assert {ping.lat_deg for ping in read_survey(tmp_path / "line.xtf")} == {None}
+        assert {ping.lat_deg for ping in source.pings()} == {None}
 
 
 def test_records_are_packed_and_unpacked():
