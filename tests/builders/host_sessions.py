@@ -11,14 +11,14 @@ from sonarpost.extensions.simulation.modem.emulated import settings_for
 
 
 class Hosts:
-    """Hosts of two emulated modems, 1 and 2, at 150 m: the travel takes 0.1 s."""
+    """Hosts of emulated modems, 1 and 2 or more, with 150 m between neighbours: the travel takes 0.1 s."""
 
-    def __init__(self, driver: str) -> None:
-        modems = {
+    def __init__(self, driver: str, modems: int = 2, **parameters: float) -> None:
+        places = {
             number: PlacedModem(settings_for(driver, address=number), LocalPosition(150.0 * number))
-            for number in (1, 2)
+            for number in range(1, modems + 1)
         }
-        self.simulator = ChannelSimulator(build_parameters({}, "test"), modems)
+        self.simulator = ChannelSimulator(build_parameters(parameters, "test"), places)
 
     def say(self, number: int, data: bytes) -> None:
         self.simulator.receive(number, data, self.simulator.now)

@@ -3,30 +3,24 @@
 import re
 
 import pytest
+from builders.host_sessions import Hosts
 
 from sonarpost.extensions.s2c.emulated_burst import IDLE_LIMIT_S, MAX_BURSTS, TRANSMISSIONS
-from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.events import PacketKind, TransmittedPacket
-from sonarpost.extensions.simulation.channel.parameters import build_parameters
-from sonarpost.extensions.simulation.channel.simulator import ChannelSimulator, PlacedModem
-from sonarpost.extensions.simulation.modem.packet_modem import PacketModemSettings
 
 ESCAPED = re.compile(rb"\+\+\+AT([^:]*):(\d+):")
 
 
-class Water:
-    """Two emulated modems, 1 and 2, at 150 m: the travel takes 0.1 s."""
+class Water(Hosts):
+    """Two emulated modems, and what they have transmitted."""
 
     def __init__(self, **parameters: float) -> None:
-        modems = {
-            number: PlacedModem(PacketModemSettings("s2c", number), LocalPosition(150.0 * number)) for number in (1, 2)
-        }
-        self.simulator = ChannelSimulator(build_parameters(parameters, "test"), modems)
+        super().__init__("s2c", **parameters)
         self.transmissions: list[TransmittedPacket] = []
 
     def say(self, number: int, command: bytes) -> None:
         """Send a command of data mode to a modem."""
-        self.simulator.receive(number, b"+++" + command + b"\n", self.simulator.now)
+        super().say(number, b"+++" + command + b"\n")
 
     def run(self, duration_s: float) -> None:
         """Let time pass."""
