@@ -24,8 +24,8 @@ from research.common.command import command_parser, report_progress, run_command
 from sonarpost.codec import emb
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.detection.snippets import to_grey
+from sonarpost.extensions.simulation.seabed.objects import ObjectKind
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, TruthObject, simulate_survey
-from sonarpost.extensions.simulation.seabed.targets import ObjectKind
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.messages import Contact, Pixels, ReconstructedImage
 from sonarpost.review.measurement import Line, measure_line

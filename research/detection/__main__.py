@@ -38,7 +38,7 @@ from research.detection.simulated import (
 from research.detection.tiles import TileScore, tile_auc, tile_scores
 from sonarpost.detection.settings import DetectorSettings
 from sonarpost.errors import ConfigError
-from sonarpost.extensions.simulation.seabed.targets import MINE_LIKE_KINDS
+from sonarpost.extensions.simulation.seabed.objects import MINE_LIKE_KINDS
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 
 OPERATING_CONFIDENCE: Final = DetectorSettings().confidence_threshold

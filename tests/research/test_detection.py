@@ -16,8 +16,8 @@ from research.detection.simulated import EvaluatedContact, EvaluatedFile
 from research.detection.tiles import tile_auc, tile_scores
 from sonarpost.detection.detector import detect
 from sonarpost.errors import SurveyFileError
+from sonarpost.extensions.simulation.seabed.objects import ObjectKind
 from sonarpost.extensions.simulation.seabed.survey import TruthObject
-from sonarpost.extensions.simulation.seabed.targets import ObjectKind
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.survey import Side, Survey
 

@@ -63,14 +63,9 @@ def run(parsed: argparse.Namespace) -> int:
         _require_visible(name, path)
     root: Path = parsed.root.absolute()
     executable = _executable(parsed.executable, root)
-    units = unit_files(
-        platform,
-        services=_services(platform, root / config.relative_to("/")),
-        executable=executable,
-        config=config,
-        router_config=router_config,
-        user=parsed.user,
-    )
+    paths = {"SONARPOST": _quoted(executable), "CONFIG": _quoted(config), "ROUTER_CONFIG": _quoted(router_config)}
+    services = _services(platform, root / config.relative_to("/"))
+    units = _unit_files(platform, services, {**paths, "USER": parsed.user})
     if parsed.dry_run:
         for name, text in units.items():
             print(f"==> {root / name}\n{text}")
@@ -88,29 +83,11 @@ def run(parsed: argparse.Namespace) -> int:
     return 0
 
 
-def unit_files(
-    platform: str, *, services: tuple[str, ...], executable: Path, config: Path, router_config: Path, user: str
-) -> Mapping[str, str]:
-    """Return the text of each file, by its path relative to the root of the file system.
-
-    Args:
-        platform: uuv, vessel or shore.
-        services: Services that the target starts.
-        executable: The sonarpost command.
-        config: TOML file of the platform.
-        router_config: JSON5 file of the router.
-        user: User of the services.
-    """
+def _unit_files(platform: str, services: tuple[str, ...], values: Mapping[str, str]) -> Mapping[str, str]:
+    """Return the text of each file, by its path relative to the root of the file system."""
     target = f"sonarpost-{platform}.target"
-    values = {
-        "PLATFORM": platform,
-        "TARGET": target,
-        "UNITS": " ".join(("sonarpost-router.service", *(f"sonarpost@{service}.service" for service in services))),
-        "SONARPOST": _quoted(executable),
-        "CONFIG": _quoted(config),
-        "ROUTER_CONFIG": _quoted(router_config),
-        "USER": user,
-    }
+    units = " ".join(("sonarpost-router.service", *(f"sonarpost@{service}.service" for service in services)))
+    values = {**values, "PLATFORM": platform, "TARGET": target, "UNITS": units}
     sources = {
         "etc/sysusers.d/sonarpost.conf": "sysusers.conf",
         f"{UNIT_FOLDER}/sonarpost-router.service": "sonarpost-router.service",

@@ -4,8 +4,10 @@ import math
 import numpy as np
 import pytest
 
-from sonarpost.extensions.simulation.seabed.survey import SonarPath, SurveySpec, echo_intensity, received_amplitude
-from sonarpost.extensions.simulation.seabed.targets import ObjectKind, SeabedObject, place_object
+from sonarpost.extensions.simulation.seabed.midwater import SonarPath
+from sonarpost.extensions.simulation.seabed.objects import ObjectKind, SeabedObject
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, echo_intensity, received_amplitude
+from sonarpost.extensions.simulation.seabed.targets import place_object
 from sonarpost.extensions.simulation.seabed.terrain import Seabed
 
 SPEC = SurveySpec(samples=1024, range_m=30.0, speed_mps=1.5, ping_rate_hz=15.0)

@@ -8,22 +8,17 @@ import numpy as np
 import pytest
 
 from sonarpost.errors import ConfigError
-from sonarpost.extensions.simulation.seabed.survey import (
-    SimulatedSurvey,
-    SonarPath,
-    SurveySpec,
-    echo_intensity,
-    simulate_survey,
-)
-from sonarpost.extensions.simulation.seabed.targets import (
+from sonarpost.extensions.simulation.seabed.midwater import SonarPath
+from sonarpost.extensions.simulation.seabed.objects import (
     FURTHER_CLUTTER_KINDS,
     FURTHER_MINE_LIKE_KINDS,
     STRUCTURE_KINDS,
     ObjectKind,
     SeabedObject,
-    place_object,
     random_object,
 )
+from sonarpost.extensions.simulation.seabed.survey import SimulatedSurvey, SurveySpec, echo_intensity, simulate_survey
+from sonarpost.extensions.simulation.seabed.targets import place_object
 from sonarpost.extensions.simulation.seabed.terrain import Seabed, SeabedKind
 from sonarpost.sonar.survey import Side
 

@@ -9,8 +9,8 @@ from scipy.ndimage import uniform_filter
 from sonarpost.cli.main import parser
 from sonarpost.errors import ConfigError
 from sonarpost.extensions.simulation.seabed import survey as simulator
+from sonarpost.extensions.simulation.seabed.objects import MINE_LIKE_KINDS
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
-from sonarpost.extensions.simulation.seabed.targets import MINE_LIKE_KINDS
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.sonar.geometry import Position, georeference, offset_between_m, ping_spacing_m
 from sonarpost.sonar.options import SurveyOptions

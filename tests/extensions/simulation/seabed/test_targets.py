@@ -4,9 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from sonarpost.extensions.simulation.seabed.objects import settled
-from sonarpost.extensions.simulation.seabed.shapes import surface_backscatter
-from sonarpost.extensions.simulation.seabed.targets import (
+from sonarpost.extensions.simulation.seabed.objects import (
     CLUTTER_KINDS,
     FURTHER_CLUTTER_KINDS,
     FURTHER_MINE_LIKE_KINDS,
@@ -15,10 +13,11 @@ from sonarpost.extensions.simulation.seabed.targets import (
     SUSPENDED_KINDS,
     ObjectKind,
     SeabedObject,
-    place_object,
     random_object,
-    surface_height_m,
+    settled,
 )
+from sonarpost.extensions.simulation.seabed.shapes import surface_backscatter, surface_height_m
+from sonarpost.extensions.simulation.seabed.targets import place_object
 from sonarpost.extensions.simulation.seabed.terrain import Seabed
 
 

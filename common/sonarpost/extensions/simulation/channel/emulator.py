@@ -11,6 +11,7 @@ import select
 import threading
 import time
 from collections import deque
+from copy import deepcopy
 from dataclasses import asdict, dataclass, field
 from typing import IO
 
@@ -111,7 +112,7 @@ class ChannelEmulator:
     def totals(self) -> PacketTotals:
         """Return the counts of packets and frames so far."""
         with self._lock:
-            return self._log.totals()
+            return deepcopy(self._log.totals)
 
     def connected(self) -> int:
         """Return the number of modems with a connected host."""
@@ -179,7 +180,7 @@ class ChannelEmulator:
             if isinstance(happened, PacketReport):
                 self._log.packet(happened, happened.unreported_reason, time.time())
             else:
-                self._log.transmission()
+                self._log.totals.transmitted += 1
         for number, line in self._lines.items():
             for output in self._simulator.take_outputs(number):
                 self._queue(line, output)
@@ -256,7 +257,7 @@ class ChannelEmulator:
             for output in self._simulator.discard_outputs(number):
                 self._log_unreported(output, "emulator stopped")
         self._write("stop")
-        totals = self._log.totals()
+        totals = self._log.totals
         self._write(
             "totals",
             transmitted=totals.transmitted,

@@ -20,8 +20,7 @@ import hashlib
 import json
 import logging
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
@@ -32,7 +31,7 @@ from sonarpost.extensions.simulation.modem.receiver import PacketReport
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class PacketTotals:
     """Counts since the start.
 
@@ -43,14 +42,17 @@ class PacketTotals:
         frames: Frames by outcome, counted at each receiver.
     """
 
-    transmitted: int
-    reported: int
-    unreported: Mapping[str, int]
-    frames: Mapping[str, int]
+    transmitted: int = 0
+    reported: int = 0
+    unreported: Counter[str] = field(default_factory=Counter)
+    frames: Counter[str] = field(default_factory=lambda: Counter({outcome.value: 0 for outcome in FrameOutcome}))
 
 
 class PacketLog:
     """Writes the log and counts packets and frames.
+
+    Attributes:
+        totals: The counts so far.
 
     Args:
         path: File to append to, or None to count only.
@@ -69,10 +71,7 @@ class PacketLog:
                 self._file = path.open("a", encoding="utf-8")
             except OSError as error:
                 raise PortError(f"{path}: the log cannot be written: {error}") from error
-        self._transmitted = 0
-        self._reported = 0
-        self._unreported: Counter[str] = Counter()
-        self._frames: Counter[str] = Counter({outcome.value: 0 for outcome in FrameOutcome})
+        self.totals = PacketTotals()
 
     def write(self, event: str, time_s: float, real_time_utc_s: float, **fields: object) -> None:
         """Write one line.
@@ -102,23 +101,15 @@ class PacketLog:
         except OSError as error:
             raise PortError(f"the log's second output cannot be written: {error}") from error
 
-    def transmission(self) -> None:
-        """Count a transmitted packet."""
-        self._transmitted += 1
-
     def packet(self, report: PacketReport, unreported_reason: str | None, real_time_utc_s: float) -> None:
         """Write and count the outcome of a packet at a receiver."""
         for frame in report.arrival.frames:
-            self._frames[frame.outcome.value] += 1
+            self.totals.frames[frame.outcome.value] += 1
         if unreported_reason is None:
-            self._reported += 1
+            self.totals.reported += 1
         else:
-            self._unreported[unreported_reason] += 1
+            self.totals.unreported[unreported_reason] += 1
         self.write("packet", report.arrival.time_s, real_time_utc_s, **_packet_fields(report, unreported_reason))
-
-    def totals(self) -> PacketTotals:
-        """Return the counts so far."""
-        return PacketTotals(self._transmitted, self._reported, dict(self._unreported), dict(self._frames))
 
     def close(self) -> None:
         """Close the file."""

@@ -18,34 +18,25 @@ from scipy.ndimage import gaussian_filter1d
 
 from sonarpost.errors import ConfigError
 from sonarpost.extensions.simulation.seabed.midwater import SonarPath, body_echoes, slices, unblocked
-from sonarpost.extensions.simulation.seabed.objects import settled
-from sonarpost.extensions.simulation.seabed.receiver_variations import varied_amplitudes
-from sonarpost.extensions.simulation.seabed.scattering import bin_by_range, scattered, vertical_beam
-from sonarpost.extensions.simulation.seabed.spec import SurveySpec
-from sonarpost.extensions.simulation.seabed.targets import (
+from sonarpost.extensions.simulation.seabed.objects import (
     CLUTTER_KINDS,
     MINE_LIKE_KINDS,
     STRUCTURE_KINDS,
     SUSPENDED_KINDS,
     ObjectKind,
     SeabedObject,
-    place_object,
     random_object,
+    settled,
 )
+from sonarpost.extensions.simulation.seabed.receiver_variations import varied_amplitudes
+from sonarpost.extensions.simulation.seabed.scattering import bin_by_range, scattered, vertical_beam
+from sonarpost.extensions.simulation.seabed.spec import SurveySpec
+from sonarpost.extensions.simulation.seabed.targets import place_object
 from sonarpost.extensions.simulation.seabed.terrain import SAND_BACKSCATTER, RippleOptions, Seabed, make_seabed
 from sonarpost.sonar.geometry import Position, offset_position
 from sonarpost.sonar.survey import ChannelPing, Ping, Samples, Side, Survey
 
-__all__ = [
-    "SONAR_NAME",
-    "SimulatedSurvey",
-    "SonarPath",
-    "SurveySpec",
-    "TruthObject",
-    "echo_intensity",
-    "received_amplitude",
-    "simulate_survey",
-]
+__all__ = ["SimulatedSurvey", "SurveySpec", "TruthObject", "echo_intensity", "received_amplitude", "simulate_survey"]
 
 FloatArray = npt.NDArray[np.float64]
 FloatImage = npt.NDArray[np.float32]

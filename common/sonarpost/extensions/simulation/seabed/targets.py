@@ -6,33 +6,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.extensions.simulation.seabed.objects import (
-    CLUTTER_KINDS,
-    FURTHER_CLUTTER_KINDS,
-    FURTHER_MINE_LIKE_KINDS,
-    MINE_LIKE_KINDS,
-    STRUCTURE_KINDS,
-    SUSPENDED_KINDS,
-    ObjectKind,
-    SeabedObject,
-    random_object,
-)
+from sonarpost.extensions.simulation.seabed.objects import SUSPENDED_KINDS, ObjectKind, SeabedObject
 from sonarpost.extensions.simulation.seabed.shapes import reach_m, surface_backscatter, surface_height_m
 from sonarpost.extensions.simulation.seabed.terrain import Seabed, SuspendedBody
-
-__all__ = [
-    "CLUTTER_KINDS",
-    "FURTHER_CLUTTER_KINDS",
-    "FURTHER_MINE_LIKE_KINDS",
-    "MINE_LIKE_KINDS",
-    "STRUCTURE_KINDS",
-    "SUSPENDED_KINDS",
-    "ObjectKind",
-    "SeabedObject",
-    "place_object",
-    "random_object",
-    "surface_height_m",
-]
 
 FloatMap = npt.NDArray[np.float32]
 
