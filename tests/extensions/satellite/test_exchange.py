@@ -284,8 +284,6 @@ def test_last_sequence_number_is_refused_and_every_other_can_be_acknowledged():
     [ack] = receiver.acknowledgements(ACKNOWLEDGE_AFTER_S)
     assert ShortAcknowledgement.unpack(ack) == ShortAcknowledgement(5, 2**32 - 1)
     with pytest.raises(ShortMessageError):
-        ShortMessage(5, 2**32 - 1, 2**32 - 1, ()).pack()
-    with pytest.raises(ShortMessageError):
         ShortAcknowledgement(5, 2**32).pack()
 
 

@@ -155,7 +155,5 @@ def test_too_long_a_decision_is_refused():
     assert len(decision_fragments(bytes(255 * FRAGMENT_BYTES), 0)) == 255
     with pytest.raises(ShortMessageError, match="decision"):
         decision_fragments(bytes(255 * FRAGMENT_BYTES + 1), 0)
-    with pytest.raises(ShortMessageError, match="length: got"):
-        ShortMessage(0, 0, 0, (Item(ItemType.CONTACT, bytes(400)),)).pack()
     with pytest.raises(ShortMessageError, match="values that fit"):
         pack_contact(received(version=2**32))

@@ -15,6 +15,18 @@ from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.files import write_atomically
 
 TRUTH_SCHEMA = 1
+_NUMBERS = {
+    "seed": "seed of every random draw",
+    "pings": "number of pings",
+    "samples": "samples per side",
+    "range_m": "slant range per side in metres",
+    "altitude_m": "altitude in metres",
+    "targets": "number of mine-like objects",
+    "clutter": "number of other objects",
+    "burial": "greatest fraction of an object's height below the seabed, 0 to 0.8",
+    "scour": "depth of the pits around objects: 0 none, 1 typical",
+}
+"""Fields of the specification that are options."""
 
 
 def add_options(parser: CommandParser) -> None:
@@ -22,17 +34,7 @@ def add_options(parser: CommandParser) -> None:
     default = SurveySpec()
     parser.description = "Write a simulated side-scan survey as XTF. The same options give the same file."
     option(parser, "out OUT.xtf", "the file to create", Path)
-    for name, text in (
-        ("seed", "seed of every random draw"),
-        ("pings", "number of pings"),
-        ("samples", "samples per side"),
-        ("range_m", "slant range per side in metres"),
-        ("altitude_m", "altitude in metres"),
-        ("targets", "number of mine-like objects"),
-        ("clutter", "number of other objects"),
-        ("burial", "greatest fraction of an object's height below the seabed, 0 to 0.8"),
-        ("scour", "depth of the pits around objects: 0 none, 1 typical"),
-    ):
+    for name, text in _NUMBERS.items():
         value = getattr(default, name)
         option(parser, f"--{name.replace('_', '-')}", text, type(value), value)
     kinds = [kind.value for kind in SeabedKind]
@@ -55,19 +57,8 @@ def run_simulate(args: argparse.Namespace) -> int:
             raise ConfigError(str(path), "", "an existing file", "a new file, or --force to replace it")
         in_new_folder(path)
     crs = projected_crs_of(args)
-    spec = SurveySpec(
-        seed=args.seed,
-        seabed=SeabedKind(args.seabed),
-        pings=args.pings,
-        samples=args.samples,
-        range_m=args.range_m,
-        altitude_m=args.altitude_m,
-        bits=args.bits,
-        targets=args.targets,
-        clutter=args.clutter,
-        burial=args.burial,
-        scour=args.scour,
-    )
+    numbers = {name: getattr(args, name) for name in _NUMBERS}
+    spec = SurveySpec(**numbers, seabed=SeabedKind(args.seabed), bits=args.bits)
     with ProgressDisplay(step=f"simulating {spec.pings} pings"):
         simulated = simulate_survey(spec)
     write_xtf(simulated.survey, args.out, crs)

@@ -48,15 +48,14 @@ _UNPRINTABLE = re.compile(r"[^ -~]|[$*,]")
 
 
 class EmulatedMicroModem:
-    """One emulated modem.
+    """One emulated modem, switched on at time zero: it sends `CAREV,…,INIT`.
 
     Args:
         config: Initial settings and timing.
-        now: Simulated time at which it is switched on; it sends `CAREV,…,INIT`.
         travel_times: One-way travel times to transponders; none by default.
     """
 
-    def __init__(self, config: EmulatedModemConfig, now: float = 0.0, travel_times: TravelTimes = dict) -> None:
+    def __init__(self, config: EmulatedModemConfig, travel_times: TravelTimes = dict) -> None:
         self.config = config
         self.settings = NvramSettings(config.address, config.data_timeout_s)
         self.clock = ModemClock(config.utc_at_zero_s)
@@ -67,7 +66,7 @@ class EmulatedMicroModem:
         self._pause_ends_s = math.inf
         self._outputs: deque[HostOutput] = deque()
         self._rebooted_at_s: float | None = None
-        self._next_revision_s = now
+        self._next_revision_s = 0.0
         self._handlers: dict[str, Callable[[Sentence, float], None]] = {
             "CCALQ": self._on_api_level_query,
             "CCCFG": self._on_configure,
@@ -89,7 +88,7 @@ class EmulatedMicroModem:
                 "CCTMQ": self._on_time_query,
                 "CCTDP": self._transmitter.send_flexible,
             }
-        self._send_revision("INIT", now)
+        self._send_revision("INIT", 0.0)
 
     @property
     def address(self) -> int:
