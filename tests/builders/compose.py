@@ -59,13 +59,16 @@ except urllib.error.HTTPError as error:
 """
 
 
-def compose_command():
-    """Return Compose v2 where it is installed, else v1."""
-    if subprocess.run(["docker", "compose", "version"], capture_output=True, check=False).returncode == 0:
-        return ["docker", "compose"]
-    if (found := shutil.which("docker-compose")) is not None:
-        return [found]
-    pytest.skip("neither `docker compose` nor docker-compose is installed")
+def compose_commands():
+    """Return Compose v2 and v1 where they are installed."""
+    found = [[path] for name in ("docker", "docker-compose") if (path := shutil.which(name))]
+    commands = [[*command, "compose"] if command[0].endswith("docker") else command for command in found]
+    commands = [
+        c for c in commands if subprocess.run([*c, "version"], capture_output=True, check=False).returncode == 0
+    ]
+    if not commands:
+        pytest.skip("neither `docker compose` nor docker-compose is installed")
+    return commands
 
 
 @dataclass
@@ -78,7 +81,7 @@ class Project:
 
     def compose(self, *arguments, check=True):
         """Run a compose command; its output."""
-        command = [*compose_command(), "-p", self.name]
+        command = [*compose_commands()[0], "-p", self.name]
         command += [option for file in self.files for option in ("-f", file)]
         command += [option for profile in PROFILES for option in ("--profile", profile)]
         done = subprocess.run(

@@ -1,9 +1,11 @@
-"""Fuzzes the NMEA parser and the driver, and checks their invariants.
+"""Fuzzes the NMEA parser and the driver with inputs of bytes, and checks their invariants.
 
-`PYTHONPATH=tests python -m builders.modem_fuzz --lines 1000000 --seed 1` processes a million lines; the test suite some
-thousands. Lines are recorded from real exchanges, or composed of every kind of sentence with likely and unlikely
-fields. Some are damaged: bytes flipped, lost or duplicated, lines truncated, joined or repeated. A seed determines the
-lines.
+`PYTHONPATH=tests python -m builders.modem_fuzz --lines 1000000 --seed 1` processes a million random lines; the test
+suite some thousands, and `run_atheris_link.py` is guided by coverage.
+
+An input is a list of steps, each with one byte for its kind and the time before it, and one for the length of the rest.
+Lines are recorded from real exchanges, or composed of every kind of sentence with likely and unlikely fields. Some are
+damaged: bytes flipped, lost or duplicated, lines truncated, joined or repeated.
 """
 
 # ruff: noqa: SIM905 - lists of this length are harder to read
@@ -11,7 +13,9 @@ lines.
 import argparse
 import random
 import time
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import cache
 
 from builders.two_drivers import TwoDrivers
 from sonarpost.errors import SentenceError
@@ -27,147 +31,111 @@ LIKELY = (
     "DATA_TIMEOUT NMEA 120000 20250606230123.348554 2.0.27087 0.93.0.09 1;2;AABB 0;1;00 1;3;AABB 0.1000 1e308 nan inf"
 ).split()
 ENDS = (PacketSent, PacketFailed, RequestDone, RequestFailed)
-ROUND_LINES = 500
+REQUEST, RAW, REAL, COMPOSED, DAMAGED_REAL, DAMAGED_COMPOSED, CHECKED = range(7)
+"""Kinds of steps: the three low bits of the first byte. The next two select a time of `PAUSES_S`."""
+PAUSES_S = (0.0, 0.01, 0.5, 7.0)
+NOT_READY = 0x80
+"""In the first byte of an input: the driver has not configured its modem."""
+MOST_STEPS = 1000
+INPUT_LINES = 500
 MAX_BYTES_TO_SEND = 1 << 20
 
 
-@dataclass
-class Fuzz:
-    """One fuzz run.
+def steps(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield the first byte and the rest of each step of an input."""
+    at = 0
+    for _ in range(MOST_STEPS):
+        if at + 2 > len(data):
+            return
+        kind, length = data[at], data[at + 1]
+        yield kind, data[at + 2 : at + 2 + length]
+        at += 2 + length
 
-    Attributes:
-        seed: Seed of every random draw.
-        lines: Number of lines so far.
-        sentences_parsed: Number of lines that were valid sentences.
+
+def check_driver(data: bytes) -> int:
+    """Pass lines to a driver and to the parser alone; return the number of sentences.
+
+    Packets are requested between the lines. Each request ends once, and a modem that answers again is used again.
+
+    Raises:
+        AssertionError: A property does not hold.
     """
-
-    seed: int
-    lines: int = 0
-    sentences_parsed: int = 0
-    real: list[bytes] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.rng = random.Random(self.seed)
-        self.real = real_lines()
-
-    def run(self, lines: int) -> None:
-        """Process lines up to a total number, in rounds with a driver each.
-
-        Raises:
-            AssertionError: An invariant is violated.
-        """
-        while self.lines < lines:
-            self._round(min(ROUND_LINES, lines - self.lines))
-
-    def _round(self, count: int) -> None:
-        driver = MicroModem(MicroModemConfig(1))
-        driver.set_poll_handler(lambda polled: [b"x" * min(3, polled.frame_bytes)] * (polled.frames // 2))
-        parser = nmea.LineAssembler()
-        now, requested, ended = 0.0, [], []
-        driver.port_opened(now)
-        if self.rng.random() < 0.8:
-            self._make_ready(driver)
-        for _ in range(count):
-            self.lines += 1
-            line = self.line()
-            self.sentences_parsed += sum(isinstance(item, nmea.Sentence) for item in parser.feed(line))
-            if self.rng.random() < 0.02:
-                data, ack, rate = b"ab", self.rng.random() < 0.5, self.rng.choice((0, 1, 4))
-                requested.append(send_request(driver, self.rng.randrange(5), data, rate, now, ack=ack))
-            events = driver.receive(line, now)
-            now += self.rng.choice((0.0, 0.0, 0.01, 0.5, 7.0))
-            events += driver.poll(now)
-            ended += [e for e in events if isinstance(e, ENDS)]
-            self._check(driver, parser, now)
-        self._recover(driver, now, requested, ended)
-
-    @staticmethod
-    def _check(driver: MicroModem, parser: nmea.LineAssembler, now: float) -> None:
-        assert parser.pending_bytes <= nmea.MAX_SENTENCE_BYTES
-        assert driver.queued <= driver.config.queued_packets + 1
-        out = driver.bytes_to_send()
-        assert len(out) < MAX_BYTES_TO_SEND
-        for item in nmea.LineAssembler().feed(out):
-            assert isinstance(item, nmea.Sentence), "the driver writes complete sentences"
-        wakeup_s = driver.next_wakeup()
-        assert wakeup_s is None or wakeup_s > now, "nothing is due after a poll"
-
-    @staticmethod
-    def _recover(driver: MicroModem, now: float, requested: list[int], ended: list[object]) -> None:
-        """Without further input every request ends once, and the driver becomes ready when the modem answers."""
-        driver.receive(b"\r\n", now)
-        for _ in range(400):
-            now += 5.0
-            ended += [e for e in driver.poll(now) if isinstance(e, ENDS)]
-            for item in nmea.LineAssembler().feed(driver.bytes_to_send()):
-                assert isinstance(item, nmea.Sentence)
-                if item.kind == "CCCFG":
-                    driver.receive(nmea.format("CACFG", *item.fields), now)
-                elif item.kind == "CCCFQ":
-                    driver.receive(nmea.format("CACFG", item.fields[0], 1), now)
-        numbers = [getattr(e, "packet_id", None) or getattr(e, "request_id", None) for e in ended]
-        assert len(numbers) == len(set(numbers)), "no request ends twice"
-        assert set(requested) <= set(numbers), "every request ends"
-        assert driver.ready
-        assert not driver.receiving
-        assert driver.queued == 0
-
-    @staticmethod
-    def _make_ready(driver: MicroModem) -> None:
-        for _ in range(20):
-            for item in nmea.LineAssembler().feed(driver.bytes_to_send()):
-                assert isinstance(item, nmea.Sentence)
-                value = item.fields[1] if item.kind == "CCCFG" else "1"
-                driver.receive(nmea.format("CACFG", item.fields[0], value), 0.0)
-        assert driver.ready
-
-    def line(self) -> bytes:
-        """Return the next line, possibly damaged."""
-        draw = self.rng.random()
-        if draw < 0.45:
-            line = self.rng.choice(self.real)
-        elif draw < 0.95:
-            fields = [self.rng.choice(LIKELY) for _ in range(self.rng.randrange(10))]
-            line = nmea.format(self.rng.choice(KINDS), *fields)
+    driver, parser = MicroModem(MicroModemConfig(1)), nmea.LineAssembler()
+    driver.set_poll_handler(lambda polled: [b"x" * min(3, polled.frame_bytes)] * (polled.frames // 2))
+    now, taken, requested, ended = 0.0, 0, [], []
+    driver.port_opened(now)
+    if not data[:1] or data[0] < NOT_READY:
+        _make_ready(driver)
+    for kind, body in steps(data):
+        now += PAUSES_S[kind >> 3 & 3]
+        if kind & 7 == REQUEST:
+            requested.append(_send_request(driver, body.ljust(3, b"\0"), now))
         else:
-            return self.rng.randbytes(self.rng.randrange(80))
-        return self._damaged(line) if self.rng.random() < 0.4 else line
-
-    def _damaged(self, line: bytes) -> bytes:
-        at = self.rng.randrange(len(line))
-        other = self.rng.choice(self.real)
-        return self.rng.choice(
-            (
-                line[:at] + bytes([line[at] ^ 1 << self.rng.randrange(8)]) + line[at + 1 :],
-                line[:at] + line[at + 1 :],
-                line[:at] + line[at : at + 4] + line[at:],
-                line[:at],
-                line[:at] + other,
-                line + line,
-                line.split(b"*")[0] + b"\r\n",
-                nmea.format(*self._swapped(line)),
-            )
-        )
-
-    def _swapped(self, line: bytes) -> list[str]:
-        """Replace one field; the checksum stays correct."""
-        fields = line[1:].split(b"*")[0].decode("ascii").split(",")
-        if len(fields) > 1:
-            fields[self.rng.randrange(1, len(fields))] = self.rng.choice(LIKELY)
-        return fields
+            line = line_of(kind & 7, body)
+            with suppress(SentenceError):
+                sentence = nmea.parse(line)
+                assert nmea.parse(sentence.encode()) == sentence, "a parsed sentence formats to itself"
+            taken += sum(isinstance(item, nmea.Sentence) for item in parser.feed(line))
+            ended += [e for e in driver.receive(line, now) if isinstance(e, ENDS)]
+        ended += [e for e in driver.poll(now) if isinstance(e, ENDS)]
+        _check(driver, parser, now)
+    _recover(driver, now, requested, ended)
+    return taken
 
 
-def send_request(driver: MicroModem, kind: int, data: bytes, rate: int, now: float, *, ack: bool) -> int:
+def _check(driver: MicroModem, parser: nmea.LineAssembler, now: float) -> None:
+    assert parser.pending_bytes <= nmea.MAX_SENTENCE_BYTES
+    assert driver.queued <= driver.config.queued_packets + 1
+    out = driver.bytes_to_send()
+    assert len(out) < MAX_BYTES_TO_SEND
+    for item in nmea.LineAssembler().feed(out):
+        assert isinstance(item, nmea.Sentence), "the driver writes complete sentences"
+    wakeup_s = driver.next_wakeup()
+    assert wakeup_s is None or wakeup_s > now, "nothing is due after a poll"
+
+
+def _recover(driver: MicroModem, now: float, requested: list[int], ended: list[object]) -> None:
+    """Without further input every request ends once, and the driver becomes ready when the modem answers."""
+    driver.receive(b"\r\n", now)
+    for _ in range(400):
+        now += 5.0
+        ended += [e for e in driver.poll(now) if isinstance(e, ENDS)]
+        for item in nmea.LineAssembler().feed(driver.bytes_to_send()):
+            assert isinstance(item, nmea.Sentence)
+            if item.kind == "CCCFG":
+                driver.receive(nmea.format("CACFG", *item.fields), now)
+            elif item.kind == "CCCFQ":
+                driver.receive(nmea.format("CACFG", item.fields[0], 1), now)
+    numbers = [getattr(e, "packet_id", None) or getattr(e, "request_id", None) for e in ended]
+    assert len(numbers) == len(set(numbers)), "no request ends twice"
+    assert set(requested) <= set(numbers), "every request ends"
+    assert driver.ready
+    assert not driver.receiving
+    assert driver.queued == 0
+
+
+def _make_ready(driver: MicroModem) -> None:
+    for _ in range(20):
+        for item in nmea.LineAssembler().feed(driver.bytes_to_send()):
+            assert isinstance(item, nmea.Sentence)
+            value = item.fields[1] if item.kind == "CCCFG" else "1"
+            driver.receive(nmea.format("CACFG", item.fields[0], value), 0.0)
+    assert driver.ready
+
+
+def _send_request(driver: MicroModem, body: bytes, now: float) -> int:
     """Send a request of one of three kinds; return its number."""
-    match kind:
+    rate = (0, 1, 4)[body[2] % 3]
+    match body[0] % 5:
         case 0:
             return driver.ping(2, now)
         case 1:
             return driver.request_packet(2, rate, now=now)
         case _:
-            return driver.send_packet(2, rate, [data], ack=ack, now=now)
+            return driver.send_packet(2, rate, [body[3:35] or b"ab"], ack=body[1] % 2 == 0, now=now)
 
 
+@cache
 def real_lines() -> list[bytes]:
     """Return the sentences for a driver in an exchange of each kind."""
     rig = TwoDrivers()
@@ -183,17 +151,59 @@ def real_lines() -> list[bytes]:
     return [passed.line for passed in rig.transferred if passed.host == 1 and not passed.to_modem]
 
 
-def parse_alone(lines: list[bytes]) -> int:
-    """Parse lines one by one and return the number of valid ones; only `SentenceError` may be raised."""
-    valid = 0
-    for line in lines:
-        try:
-            sentence = nmea.parse(line)
-        except SentenceError:
-            continue
-        valid += 1
-        assert nmea.parse(sentence.encode()) == sentence, "a parsed sentence formats to itself"
-    return valid
+def line_of(kind: int, body: bytes) -> bytes:
+    """Return the line or lines of a step."""
+    real = real_lines()
+    match kind:
+        case 2:
+            return b"".join(real[number % len(real)] for number in body[:8])
+        case 3:
+            fields = [LIKELY[number % len(LIKELY)] for number in body[1:10]]
+            return nmea.format(KINDS[sum(body[:1]) % len(KINDS)], *fields)
+        case 4 | 5 if len(body) > 3:
+            how, at, other = body[:3]
+            return _damaged(line_of(kind - 2, body[3:]), how, at, real[other % len(real)])
+        case 6:
+            return with_checksum(b"$" + body)
+        case _:
+            return body
+
+
+def with_checksum(start: bytes) -> bytes:
+    """Return a line with its checksum, whether or not its text can have one."""
+    total = 0
+    for byte in start[1:]:
+        total ^= byte
+    return start + b"*%02X\r\n" % total
+
+
+def _damaged(line: bytes, how: int, at: int, other: bytes) -> bytes:
+    bit, at = 1 << at % 8, at % len(line)
+    fields = line.split(b"*")[0].split(b",")
+    fields[1:] = [LIKELY[how % len(LIKELY)].encode() if n == at % 10 else f for n, f in enumerate(fields[1:])]
+    return (
+        line[:at] + bytes([line[at] ^ bit]) + line[at + 1 :],
+        line[:at] + line[at + 1 :],
+        line[:at] + line[at : at + 4] + line[at:],
+        line[:at],
+        line[:at] + other,
+        line + line,
+        line.split(b"*")[0] + b"\r\n",
+        with_checksum(b",".join(fields)),
+    )[how % 8]
+
+
+def random_input(rng: random.Random, lines: int = INPUT_LINES) -> bytes:
+    """Return an input with this number of steps, a fiftieth of them requests."""
+    kinds = rng.choices(range(6), (2, 5, 26, 29, 18, 20), k=lines)
+    longest = {REQUEST: 8, RAW: 79, REAL: 1, COMPOSED: 10, DAMAGED_REAL: 4, DAMAGED_COMPOSED: 13}
+    data = bytearray()
+    for kind in kinds:
+        shortest = longest[kind] if kind in (REAL, DAMAGED_REAL) else 0
+        body = rng.randbytes(rng.randint(shortest, longest[kind]))
+        data += bytes([kind | rng.choice((0, 0, 1, 2, 3)) << 3, len(body)]) + body
+    data[0] |= NOT_READY * (rng.random() < 0.2)
+    return bytes(data)
 
 
 def main() -> None:
@@ -202,12 +212,9 @@ def main() -> None:
     parser.add_argument("--lines", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=1)
     parsed = parser.parse_args()
-    fuzz, started_s = Fuzz(parsed.seed), time.monotonic()
-    fuzz.run(parsed.lines)
-    valid = parse_alone([fuzz.line() for _ in range(parsed.lines // 10)])
-    seconds = time.monotonic() - started_s
-    alone = f"{valid} of {parsed.lines // 10} alone"
-    print(f"{fuzz.lines} lines, {fuzz.sentences_parsed} taken as sentences, {alone}; {seconds:.0f} s")
+    rng, started_s = random.Random(parsed.seed), time.monotonic()
+    taken = sum(check_driver(random_input(rng)) for _ in range(parsed.lines // INPUT_LINES))
+    print(f"{parsed.lines} lines, {taken} sentences; {time.monotonic() - started_s:.0f} s")
 
 
 if __name__ == "__main__":

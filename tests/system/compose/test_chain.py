@@ -9,7 +9,7 @@ import re
 import subprocess
 
 from builders.common import REPOSITORY
-from builders.compose import KILL, LOG_IN, SERVICES, Project, compose_command, docker, until
+from builders.compose import KILL, LOG_IN, SERVICES, Project, compose_commands, docker, until
 
 REACHES = """
 import concurrent.futures, socket
@@ -66,7 +66,7 @@ def test_commands_of_the_page_show_and_copy_the_images(project, tmp_path):
     page = (REPOSITORY / "docs" / "how-to" / "view-images.md").read_text()
     [commands] = re.findall(r"^```sh\n(docker-compose exec .*?)^```$", page, re.MULTILINE | re.DOTALL)
     assert commands in (REPOSITORY / "docs" / "how-to" / "containers.md").read_text()
-    text = commands.replace("docker-compose ", " ".join(compose_command()) + " ")
+    text = commands.replace("docker-compose ", " ".join(compose_commands()[0]) + " ")
     text = text.replace(" exec ", " exec -T ").replace(" ./images", f" {tmp_path}/images")
     names = {"COMPOSE_PROJECT_NAME": project.name, "COMPOSE_FILE": ":".join(project.files)}
     environment = os.environ | project.environment | names

@@ -10,7 +10,7 @@ import tomllib
 import pytest
 import yaml
 from builders.common import REPOSITORY
-from builders.compose import PUBLISHED
+from builders.compose import PUBLISHED, compose_commands
 
 from sonarpost.cli.deployment.config_files import configuration_type, example_files
 from sonarpost.config import load, overridden_keys, service_packages
@@ -169,19 +169,6 @@ def test_the_dockerfile_and_the_compose_file_name_the_same_base():
     assert variables(TEXT)["SONARPOST_BASE"] == base
     assert not base.endswith((":latest", "debian"))
     assert re.search(r":\d+\.\d+\.\d+$", variables(TEXT)["ROUTER_IMAGE"])
-
-
-def compose_commands():
-    found = []
-    if shutil.which("docker"):
-        version = subprocess.run(["docker", "compose", "version"], capture_output=True, check=False)
-        if version.returncode == 0:
-            found.append(["docker", "compose"])
-    if (path := shutil.which("docker-compose")) is not None:
-        found.append([path])
-    if not found:
-        pytest.skip("neither `docker compose` nor docker-compose is installed")
-    return found
 
 
 def compose_config(command, folder, *options):
