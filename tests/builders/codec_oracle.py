@@ -3,6 +3,7 @@
 Used by the coverage-guided fuzzer (`run_atheris.py`) and by the bounded tests of the default suite.
 """
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -10,6 +11,7 @@ from functools import cache
 import numpy as np
 
 from builders.common import GOLDEN_FOLDER
+from builders.images import contact
 from sonarpost.codec.interface import COMMON_SIDES_PX, Codec, Mask, StreamHeader, model_tag
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import load
@@ -18,6 +20,8 @@ from sonarpost.errors import StreamError
 GOLDEN = GOLDEN_FOLDER
 VALID_HEADER, GAP = 1, 2
 """Flags in the first byte of an input: put a valid header before the body; mark a part of the body as missing."""
+_SIZES = ((16, 16), (32, 48), (80, 80), (17, 33))
+_BUDGETS = (40, 400)
 PREFIX_BYTES = 6
 """Flags, codec, row and column of the size, start and length of the gap; then the stream or the body."""
 
@@ -87,3 +91,40 @@ def check(stream: bytes, received: Mask | None, ids: Sequence[int]) -> str:
     assert decoded.missing.dtype == np.bool_
     assert not decoded.image[decoded.missing].any()
     return "concealed" if decoded.missing.any() else "complete"
+
+
+def golden_streams(ids):
+    """Yield the golden streams of these codecs."""
+    found = [bytes.fromhex(path.read_text()) for path in sorted(GOLDEN.glob("*/*.hex")) if "pixels" not in path.name]
+    for path in sorted(GOLDEN.glob("emb/*.json")):
+        found += [bytes.fromhex(case["stream"]) for case in json.loads(path.read_text()).values()]
+    yield from (stream for stream in found if stream and stream[0] in ids)
+
+
+def new_streams(ids):
+    """Yield streams of speckle with a highlight and a shadow, for the budgets that the codec can meet."""
+    for codec_id in ids:
+        codec = codec_for(codec_id)
+        for size in _SIZES:
+            for budget in (*_BUDGETS, None):
+                stream = _encoded(codec, contact(*size), budget)
+                if stream is not None and len(stream) <= 4096:
+                    yield stream
+
+
+def as_input(stream, flags, ids):
+    """Return the input that `codec_oracle.stream_of` parses to this stream, or to its body, depending on the flags."""
+    header = StreamHeader.unpack(stream)
+    if not flags & VALID_HEADER:
+        return bytes([flags]) + bytes(PREFIX_BYTES - 3) + bytes([3, flags & GAP]) + stream
+    sides = [
+        COMMON_SIDES_PX.index(side) if side in COMMON_SIDES_PX else 0 for side in (header.height_px, header.width_px)
+    ]
+    return bytes([flags, ids.index(header.codec_id), *sides, 3, flags & GAP]) + stream[header.size :]
+
+
+def _encoded(codec, image, budget):
+    try:
+        return codec.encode(image, budget)
+    except StreamError:
+        return None

@@ -1,7 +1,7 @@
 """Fuzzes the NMEA parser and the driver with inputs of bytes, and checks their invariants.
 
 `PYTHONPATH=tests python -m builders.modem_fuzz --lines 1000000 --seed 1` processes a million random lines; the test
-suite some thousands, and `run_atheris_link.py` is guided by coverage.
+suite some thousands, and `run_atheris.py` is guided by coverage.
 
 An input is a list of steps, each with one byte for its kind and the time before it, and one for the length of the rest.
 Lines are recorded from real exchanges, or composed of every kind of sentence with likely and unlikely fields. Some are

@@ -1,6 +1,6 @@
 """Check of the survey readers with arbitrary bytes: they raise SurveyFileError or return plausible pings.
 
-The coverage-guided fuzzer (`run_atheris_survey.py`) and the tests of the default suite use it.
+The coverage-guided fuzzer (`run_atheris.py`) and the tests of the default suite use it.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Hostile frames for the v1 receiver, as a short and a long run; `run_atheris_link.py` is guided by coverage.
+"""Hostile frames for the v1 receiver, as a short and a long run; `run_atheris.py` is guided by coverage.
 
 PYTHONPATH=tests python -m builders.v1_fuzz FRAMES [SEED]
 """

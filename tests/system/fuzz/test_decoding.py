@@ -7,8 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from builders.codec_oracle import check, codec_for, codec_ids, stream_of, valid_header
-from builders.fuzz_seeds import as_input, golden_streams, new_streams
+from builders.codec_oracle import (
+    as_input,
+    check,
+    codec_for,
+    codec_ids,
+    golden_streams,
+    new_streams,
+    stream_of,
+    valid_header,
+)
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -1,4 +1,4 @@
-"""The checks of `run_atheris_link.py` on genuine traffic and on a fixed set of damaged inputs."""
+"""The checks of `run_atheris.py` on genuine traffic and on a fixed set of damaged inputs."""
 
 import random
 
