@@ -12,20 +12,20 @@ from sonarpost.messages import CodedImage, Decision, ReconstructedImage
 from sonarpost.services.c2.tasking import Tasking
 
 
-def image_entry(image: ReconstructedImage, name: str, site: str) -> JournalEntry:
-    """Return the entry of an image; `name` is that of its files without suffix."""
-    return _entry_of_image(keys.shore_image(image.vessel_id, site), image, name)
+def image_entry(image: ReconstructedImage, name: str, site: str, payload: bytes = b"") -> JournalEntry:
+    """Return the entry of an image with its payload, if known; `name` is that of its files without suffix."""
+    return _entry_of_image(keys.shore_image(image.vessel_id, site), image, name, payload)
 
 
 def coded_entry(image: CodedImage, site: str) -> JournalEntry:
     """Return the entry of an image in coded form; it has no files."""
-    return _entry_of_image(keys.shore_coded(image.vessel_id, site), image, "")
+    return _entry_of_image(keys.shore_coded(image.vessel_id, site), image, "", b"")
 
 
-def _entry_of_image(key: str, image: ReconstructedImage | CodedImage, name: str) -> JournalEntry:
+def _entry_of_image(key: str, image: ReconstructedImage | CodedImage, name: str, payload: bytes) -> JournalEntry:
+    names = (image.vessel_id, image.vehicle_id, image.image_id)
     subject = f"{image.vehicle_id}/{image.image_id}/{image.first_frame_utc_s!r}"
-    vessel, vehicle = image.vessel_id, image.vehicle_id
-    return JournalEntry(key, image, vessel, vehicle, image.image_id, subject, image.version, image.contact, name)
+    return JournalEntry(key, image, *names, subject, image.version, image.contact, name, payload)
 
 
 def decision_entry(decision: Decision, site: str) -> JournalEntry:

@@ -139,14 +139,16 @@ class Archive:
 
     # Records of vessels
 
-    def store_image(self, image: ReconstructedImage, relayed_utc_s: float) -> WrittenImage:
-        """Add an image to the next `flush`; a different image with the same file name stays."""
+    def store_image(self, image: ReconstructedImage, relayed_utc_s: float, payload: bytes = b"") -> WrittenImage:
+        """Add an image with its payload, if known, to the next `flush`; another one with its file name stays."""
         self.index()
-        written = self._add_image(image, relayed_utc_s, time.time())
+        written = self._add_image(image, relayed_utc_s, time.time(), payload)
         self._logs.append(partial(copy_context().run, _log_image, image, relayed_utc_s, written))
         return written
 
-    def _add_image(self, image: ReconstructedImage, relayed_utc_s: float | None, accepted_utc_s: float) -> WrittenImage:
+    def _add_image(
+        self, image: ReconstructedImage, relayed_utc_s: float | None, accepted_utc_s: float, payload: bytes = b""
+    ) -> WrittenImage:
         text = side_car_text(image)
         name, is_stored, is_conflict = self._place(image, text)
         written = WrittenImage(Path(image.vessel_id, f"{name}.tiff"), not is_stored, is_conflict)
@@ -159,7 +161,7 @@ class Archive:
             )
             row = row_of_image(name, image, relayed_utc_s, accepted_utc_s, contents)
             self._batch.images.append(StoredImage(row, tuple(zip(SUFFIXES, contents, strict=True))))
-        self._entries.append(image_entry(image, name, self._config.site))
+        self._entries.append(image_entry(image, name, self._config.site, payload))
         return written
 
     def _place(self, image: ReconstructedImage, text: bytes) -> tuple[str, bool, bool]:

@@ -12,12 +12,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from sonarpost.archive.backlog import Backlog, BacklogRecord
-from sonarpost.archive.decode_worker import Decoded, DecodeWorker
+from sonarpost.archive.decode_worker import Decoded, DecodedImage, DecodeWorker
 from sonarpost.delivery.store import Store
 from sonarpost.errors import DeliveryError, can_concern_record
 from sonarpost.limits import Turns, limit
 from sonarpost.logs import kv
-from sonarpost.messages import ReconstructedImage
 from sonarpost.runtime.service import ServiceStoppingError
 
 log = logging.getLogger(__name__)
@@ -150,7 +149,7 @@ class Decoding:
         store: Store,
         backlog: Callable[[], Backlog],
         workers: Sequence[DecodeWorker],
-        keep: Callable[[Sequence[ReconstructedImage], Sequence[BacklogRecord]], None],
+        keep: Callable[[Sequence[DecodedImage], Sequence[BacklogRecord]], None],
         on_undecodable: Callable[[BacklogRecord, str], None],
         stopping: threading.Event,
     ) -> None:
@@ -254,7 +253,7 @@ class Decoding:
             return
         is_alone = len(batch) == 1
         failed: dict[str, float] = {}
-        decoded: list[tuple[BacklogRecord, ReconstructedImage]] = []
+        decoded: list[tuple[BacklogRecord, DecodedImage]] = []
         for entry, (result, taken_s) in zip(batch, results, strict=True):
             if result.image is not None:
                 decoded.append((entry, result.image))
@@ -288,7 +287,7 @@ class Decoding:
             self._idle.append(worker)
         return result, time.monotonic() - started_s
 
-    def _keep_parts(self, group: Sequence[tuple[BacklogRecord, ReconstructedImage]], *, is_alone: bool) -> set[str]:
+    def _keep_parts(self, group: Sequence[tuple[BacklogRecord, DecodedImage]], *, is_alone: bool) -> set[str]:
         """Store images, after a failure in halves; return the vessels of those that cannot be stored."""
         entries = [entry for entry, _ in group]
         try:
@@ -334,16 +333,16 @@ class Decoding:
 
 
 def _groups(
-    decoded: Sequence[tuple[BacklogRecord, ReconstructedImage]],
-) -> Iterator[list[tuple[BacklogRecord, ReconstructedImage]]]:
+    decoded: Sequence[tuple[BacklogRecord, DecodedImage]],
+) -> Iterator[list[tuple[BacklogRecord, DecodedImage]]]:
     """Yield images in groups of at most `BATCH_BYTES` of pixels, at least one each."""
-    group: list[tuple[BacklogRecord, ReconstructedImage]] = []
+    group: list[tuple[BacklogRecord, DecodedImage]] = []
     size_bytes = 0
     for each in decoded:
-        size_bytes += len(each[1].pixels.data)
+        size_bytes += len(each[1].record.pixels.data)
         if group and size_bytes > BATCH_BYTES:
             yield group
-            group, size_bytes = [], len(each[1].pixels.data)
+            group, size_bytes = [], len(each[1].record.pixels.data)
         group.append(each)
     if group:
         yield group

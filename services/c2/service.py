@@ -16,7 +16,7 @@ from sonarpost import keys, wire
 from sonarpost.archive import image_parts
 from sonarpost.archive.backlog import BacklogRecord
 from sonarpost.archive.codebook_transfer import CodebookFetcher
-from sonarpost.archive.decode_worker import DecodeWorker
+from sonarpost.archive.decode_worker import DecodedImage, DecodeWorker
 from sonarpost.archive.decoder import OTHER_PIXELS
 from sonarpost.archive.journal import Accepted, JournalEntry
 from sonarpost.bus.connectivity import declare_presence
@@ -252,7 +252,7 @@ class C2Service(Service[C2Config]):
         self._archive.queue_image(key, effects.payload, image)
         effects.count("images_accepted")
 
-    def _keep_images(self, images: Sequence[ReconstructedImage], entries: Sequence[BacklogRecord]) -> None:
+    def _keep_images(self, images: Sequence[DecodedImage], entries: Sequence[BacklogRecord]) -> None:
         """Store and publish decoded images of entries of the backlog.
 
         Raises:
@@ -261,11 +261,11 @@ class C2Service(Service[C2Config]):
         """
         # Records are added to the archive and flushed by one thread at a time.
         with self.handling():
-            written = [self._archive.store_image(image, image.last_frame_utc_s) for image in images]
+            written = [self._archive.store_image(image, image.last_frame_utc_s, payload) for image, payload in images]
             for entry in entries:
                 self._archive.finished(entry)
             stored = self._archive.flush()
-        for image, files in zip(images, written, strict=True):
+        for (image, _), files in zip(images, written, strict=True):
             self.count("images_stored" if files.is_new else "images_repeated")
             if files.is_new and files.is_conflict:
                 self.count("images_conflicting")

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Final, Literal
+from typing import IO, Final, Literal, NamedTuple
 
 import msgpack
 
@@ -48,6 +48,13 @@ _MACHINE: Final = frozenset({EXIT_MACHINE, -signal.SIGKILL, -signal.SIGTERM, -si
 _LENGTH = struct.Struct(">I")
 
 
+class DecodedImage(NamedTuple):
+    """A decoded image with its payload; empty if that is not known."""
+
+    record: ReconstructedImage
+    payload: bytes = b""
+
+
 @dataclass(frozen=True, slots=True)
 class Decoded:
     """Result for one image.
@@ -60,7 +67,7 @@ class Decoded:
             exceeded its processor time; else empty.
     """
 
-    image: ReconstructedImage | None = None
+    image: DecodedImage | None = None
     reason: str = ""
     missing_model: str = ""
     failure: Literal["", "machine", "crash"] = ""
@@ -134,7 +141,8 @@ class DecodeWorker:
         fields = msgpack.unpackb(answer)
         if "payload" not in fields:
             return Decoded(reason=fields["reason"], missing_model=fields["model"])
-        return Decoded(wire.decode(ReconstructedImage, fields["payload"], f"image of {vessel_id}"))
+        payload = fields["payload"]
+        return Decoded(DecodedImage(wire.decode(ReconstructedImage, payload, f"image of {vessel_id}"), payload))
 
     def _ended(self, status: int, *, is_ready: bool) -> Decoded:
         if not is_ready:

@@ -48,8 +48,8 @@ class JournalEntry:
         version: Its version; of equal versions the one with the highest number is the latest.
         contact: The contact with its position, if it has one.
         name: Name of its files without suffix, if its pixels are in files; else empty.
+        payload: Its payload as it is published, without its number; made from the record if it is not known.
         fields: Its payload as a map.
-        payload: Its payload as it is published, without its number.
     """
 
     key: str
@@ -61,12 +61,12 @@ class JournalEntry:
     version: int = 0
     contact: Contact | None = None
     name: str = ""
+    payload: bytes = field(default=b"", repr=False)
     fields: dict[str, Any] = field(init=False, repr=False)
-    payload: bytes = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         self.fields = wire.map_of(self.record)
-        self.payload = msgpack.packb(self.fields, use_bin_type=True)
+        self.payload = self.payload or msgpack.packb(self.fields, use_bin_type=True)
 
     def columns(self, accepted_utc_s: float) -> dict[str, Any]:
         """Return the columns of the record, without its number, if it is accepted at this time.
