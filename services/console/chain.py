@@ -6,7 +6,7 @@ adds the connection between browser and server.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -52,14 +52,6 @@ class RouterState:
 
 
 @dataclass(frozen=True, slots=True)
-class HeardVehicle:
-    """A vehicle with the age of its last received frame."""
-
-    vehicle_id: str
-    age_s: float
-
-
-@dataclass(frozen=True, slots=True)
 class ChainLink:
     """One place of the chain.
 
@@ -87,7 +79,7 @@ def chain_links(
     side: ConsoleSide,
     router: RouterState | None,
     services: Iterable[ServiceStatus],
-    vehicles: Sequence[HeardVehicle],
+    vehicles: Mapping[str, float],
     expected_vehicles: Sequence[str],
     *,
     now_utc_s: float,
@@ -99,7 +91,7 @@ def chain_links(
         side: At a shore site, the chain ends at c2.
         router: Connection to the router; None for a console without a network, whose chain has the server only.
         services: Last health of all services.
-        vehicles: Vehicles with a received frame.
+        vehicles: Age of the last received frame by vehicle.
         expected_vehicles: Names of the configured vehicles.
         now_utc_s: Present time.
         vehicle_stale_s: Time without a frame after which a vehicle is degraded.
@@ -152,22 +144,21 @@ def _service(
 
 
 def _vehicles(
-    vehicles: Sequence[HeardVehicle],
+    vehicles: Mapping[str, float],
     expected: Sequence[str],
     router: RouterState,
     now_utc_s: float,
     stale_s: float,
 ) -> list[ChainLink]:
-    names = {one.vehicle_id for one in vehicles}
     links: list[ChainLink] = []
-    for one in vehicles:
-        heard = now_utc_s - one.age_s
-        if one.age_s > stale_s:
-            links.append(ChainLink("vehicle", one.vehicle_id, "degraded", "no_frames", "", heard, heard))
+    for name, age_s in vehicles.items():
+        heard = now_utc_s - age_s
+        if age_s > stale_s:
+            links.append(ChainLink("vehicle", name, "degraded", "no_frames", "", heard, heard))
         else:
-            links.append(ChainLink("vehicle", one.vehicle_id, "ok", heard_utc_s=heard))
+            links.append(ChainLink("vehicle", name, "ok", heard_utc_s=heard))
     since = router.listening_since_utc_s
-    links += [ChainLink("vehicle", name, "waiting", since_utc_s=since) for name in expected if name not in names]
+    links += [ChainLink("vehicle", name, "waiting", since_utc_s=since) for name in expected if name not in vehicles]
     return sorted(links, key=lambda link: link.name) or [ChainLink("vehicle", "", "waiting", since_utc_s=since)]
 
 

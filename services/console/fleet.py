@@ -14,7 +14,7 @@ from sonarpost.detection.difficulty import RELIABLE_PD, unreliable_text
 from sonarpost.messages import AcousticFrame, QueueState, VehicleRange
 from sonarpost.monitoring.fleet import FleetTracker, ServiceStatus
 from sonarpost.review.positions import distance_m
-from sonarpost.services.console.chain import SERVICE_STALE_S, ChainHistory, HeardVehicle, RouterState, chain_links
+from sonarpost.services.console.chain import SERVICE_STALE_S, ChainHistory, RouterState, chain_links
 from sonarpost.services.console.config import ConsoleConfig
 from sonarpost.services.console.store.serialisers import Json
 from sonarpost.services.console.store.tracks import latest_statuses, status_json
@@ -132,11 +132,11 @@ class FleetMonitor:
             "frames_per_minute": sum(now - at_s < 60 for at_s in link.frames_at_s),
         }
 
-    def heard_vehicles(self, now_s: float | None = None) -> list[HeardVehicle]:
-        """Return the vehicles with a received frame."""
+    def heard_vehicles(self, now_s: float | None = None) -> dict[str, float]:
+        """Return the age of the last received frame by vehicle, in seconds."""
         now = time.monotonic() if now_s is None else now_s
         with self._lock:
-            return [HeardVehicle(name, max(0.0, now - link.received_s)) for name, link in sorted(self._links.items())]
+            return {name: max(0.0, now - link.received_s) for name, link in sorted(self._links.items())}
 
     def service_list(self) -> list[Json]:
         """Return the state of all services."""

@@ -16,7 +16,7 @@ from sonarpost.messages import (
     ReconstructedImage,
     TaskingState,
 )
-from sonarpost.modem.interface import ModemCapabilities, RateInfo
+from sonarpost.modem.interface import ModemCapabilities
 from sonarpost.modem.registry import modem_driver
 from sonarpost.review.measurement import Line, measure_line
 from sonarpost.review.objects import AssociationRule
@@ -40,7 +40,7 @@ from sonarpost.services.console.store.contact_detail import (
     contact_detail_json,
     withdraw_measurement,
 )
-from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter, NotFoundError, remove_images
+from sonarpost.services.console.store.contacts import ContactCounts, ContactFilter, remove_images
 from sonarpost.services.console.store.database import (
     Actor,
     Database,
@@ -53,7 +53,7 @@ from sonarpost.services.console.store.database import (
 )
 from sonarpost.services.console.store.decisions import DecisionInput, DeliveryStates
 from sonarpost.services.console.store.requests import VehicleLink, costs_json, estimate_request
-from sonarpost.services.console.store.serialisers import RECORD_JSON, Json, contact_json, decode_image
+from sonarpost.services.console.store.serialisers import RECORD_JSON, Json, contact_json, find_image
 from sonarpost.services.console.store.truth import Truth
 
 LAST_DECISION_S = 12 * 3600.0
@@ -229,10 +229,7 @@ class ConsoleState:
     def image(self, contact_id: str, version: int) -> ReconstructedImage:
         """Return the record of an image version."""
         with self.database.read() as db:
-            row = contacts.find_version(db, contact_id, version)
-        if row is None:
-            raise NotFoundError("contact", "version", version, f"a version of {contact_id}")
-        return decode_image(row)
+            return find_image(db, contact_id, version)
 
     @property
     def _has_downlink(self) -> bool:
@@ -240,11 +237,9 @@ class ConsoleState:
         return self.config.role == "shore" or OP_MODEM in self.config.command_consumers
 
     def _link_to(self, vehicle_id: str) -> VehicleLink:
-        uplink = self._rate(self.fleet.uplink_rate(vehicle_id, self.config.assumed_rate))
+        number = self.fleet.uplink_rate(vehicle_id, self.config.assumed_rate)
+        uplink = None if number is None else self.rates.get(number)
         return VehicleLink(self.downlink_rate, uplink, self.fleet.frame_loss(vehicle_id))
-
-    def _rate(self, number: int | None) -> RateInfo | None:
-        return None if number is None else self.rates.get(number)
 
     def fleet_state(self) -> Json:
         """Return the present state of services and vehicles."""

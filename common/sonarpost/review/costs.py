@@ -52,22 +52,6 @@ class RequestCost:
         return None if self.uplink_s is None else self.downlink_s + self.uplink_s
 
 
-def packets_for(payload_bytes: int, rate: RateInfo, overhead_bytes: int) -> int:
-    """Return the number of packets of a rate for a payload, with `overhead_bytes` in each frame."""
-    frame_bytes = rate.frame_bytes - overhead_bytes
-    return math.ceil(math.ceil(payload_bytes / frame_bytes) / rate.frames)
-
-
-def airtime_of_frames(frames: int, rate: RateInfo) -> float:
-    """Return the air time in seconds of the packets that carry this number of frames."""
-    return math.ceil(frames / rate.frames) * rate.airtime_s
-
-
-def least_airtime_s(payload_bytes: int, rate: RateInfo) -> float:
-    """Return the air time in seconds of a payload that shares full packets of a rate with other data."""
-    return payload_bytes / rate.packet_bytes * rate.airtime_s
-
-
 def request_cost(
     kind: str,
     *,
@@ -102,7 +86,9 @@ def request_cost(
     wanted_bytes = max(0, total_bytes - bytes_received)
     if uplink_rate is None:
         return RequestCost(downlink_s, None, wanted_bytes, total_bytes)
-    packets = packets_for(math.ceil(wanted_bytes / (1 - min(0.9, loss or 0.0))), uplink_rate, overhead_bytes)
+    sent_bytes = math.ceil(wanted_bytes / (1 - min(0.9, loss or 0.0)))
+    frames = math.ceil(sent_bytes / (uplink_rate.frame_bytes - overhead_bytes))
+    packets = math.ceil(frames / uplink_rate.frames)
     return RequestCost(downlink_s, packets * uplink_rate.airtime_s, wanted_bytes, total_bytes)
 
 

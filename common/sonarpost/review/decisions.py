@@ -28,7 +28,6 @@ class ReviewResult:
         counting: Decision that counts; None if `state` is `unreviewed`.
         standing: Decisions that are neither withdrawn, overruled nor replaced by their operator, in the given order.
         withdrawn: Identifiers of the withdrawn decisions.
-        overruled: Identifiers of the overruled decisions.
         withdrawals: Identifiers of the records that withdraw a decision.
     """
 
@@ -36,7 +35,6 @@ class ReviewResult:
     counting: Decision | None
     standing: tuple[Decision, ...]
     withdrawn: frozenset[str]
-    overruled: frozenset[str]
     withdrawals: frozenset[str]
 
     @property
@@ -57,7 +55,7 @@ def review_result(decisions: Sequence[Decision]) -> ReviewResult:
     withdrawals = frozenset(d.decision_id for d in decisions if d.withdraws is not None)
     withdrawn = frozenset(d.withdraws for d in decisions if d.withdraws in identifiers)
     valid = [d for d in decisions if d.decision_id not in withdrawn | withdrawals]
-    overruled = frozenset(name for d in valid for name in d.overrules if name in identifiers and name != d.decision_id)
+    overruled = {name for d in valid for name in d.overrules if name in identifiers and name != d.decision_id}
     latest = {d.operator: d for d in valid if d.decision_id not in overruled}
     standing = tuple(d for d in valid if latest.get(d.operator) is d)
     verdicts = {d.verdict for d in standing}
@@ -69,4 +67,4 @@ def review_result(decisions: Sequence[Decision]) -> ReviewResult:
     elif standing:
         counting = standing[-1]
         state = counting.verdict
-    return ReviewResult(state, counting, standing, withdrawn, overruled, withdrawals)
+    return ReviewResult(state, counting, standing, withdrawn, withdrawals)

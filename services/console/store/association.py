@@ -207,24 +207,8 @@ def isolate_look(db: sqlite3.Connection, contact_id: str) -> None:
         db.execute("UPDATE contact SET group_id = ? WHERE id = ?", (object_id, contact_id))
 
 
-def separate_look(db: sqlite3.Connection, contact_id: str, others: Iterable[str], rule: AssociationRule) -> None:
-    """Separate a look from others for good."""
-    others = set(others)
-    for other in others:
-        _store_pair(db, contact_id, other, joined=False)
-    db.execute("UPDATE contact SET group_id = NULL WHERE id = ?", (contact_id,))
-    assign_objects(db, [contact_id, *others], rule)
-
-
-def join_looks(db: sqlite3.Connection, ones: Sequence[str], others: Sequence[str], rule: AssociationRule) -> None:
-    """Join the looks of two objects for good."""
-    for one in ones:
-        for other in others:
-            _store_pair(db, one, other, joined=True)
-    assign_objects(db, [*ones, *others], rule)
-
-
-def _store_pair(db: sqlite3.Connection, one: str, other: str, *, joined: bool) -> None:
+def store_pair(db: sqlite3.Connection, one: str, other: str, *, joined: bool) -> None:
+    """Store that a person joined two looks, or separated them."""
     db.execute("INSERT OR REPLACE INTO look_pair (a, b, joined) VALUES (?, ?, ?)", (*ordered_pair(one, other), joined))
 
 

@@ -11,10 +11,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from sonarpost import wire
 from sonarpost.export.contacts import ExportContact, ImageSideCar, side_car
 from sonarpost.export.tables import further_values
-from sonarpost.messages import Decision, ReconstructedImage
+from sonarpost.messages import ReconstructedImage
 from sonarpost.modem.interface import RateInfo
 from sonarpost.review.measurement import measured_size, summary
 from sonarpost.review.objects import AssociationRule
@@ -22,19 +21,17 @@ from sonarpost.review.true_scale import ImageLine
 from sonarpost.services.console.store.association import earlier_contacts
 from sonarpost.services.console.store.contacts import (
     ContactFilter,
-    NotFoundError,
     find_contact,
-    find_version,
     list_contacts,
 )
-from sonarpost.services.console.store.database import Actor, DisplayedImage, add_audit_entry, insert_row
-from sonarpost.services.console.store.decisions import standing_decisions
+from sonarpost.services.console.store.database import Actor, DisplayedImage, NotFoundError, add_audit_entry, insert_row
+from sonarpost.services.console.store.decisions import decisions_on, standing_decisions
 from sonarpost.services.console.store.related_images import related_images_json
 from sonarpost.services.console.store.serialisers import (
     Json,
     audit_json,
     contact_json,
-    decode_image,
+    find_image,
     list_records,
     versions_json,
 )
@@ -50,11 +47,9 @@ def contact_detail_json(
         NotFoundError: There is no such contact.
     """
     row = find_contact(db, contact_id)
-    newest = find_version(db, contact_id, row["version"])
-    assert newest is not None
     has_others = row["looks"] > 1
     looks = list_contacts(db, ContactFilter(group=row["group_id"]))["items"] if has_others else []
-    record = decode_image(newest).contact
+    record = find_image(db, contact_id).contact
     measured = list_measurements(db, contact_id)
     audit = db.execute("SELECT * FROM audit WHERE contact_id = ? ORDER BY seq", (contact_id,))
     return {
@@ -94,16 +89,10 @@ class StoredContact:
     lines: tuple[ImageLine, ...]
 
 
-def find_stored_contact(db: sqlite3.Connection, contact_id: str, version: int) -> StoredContact | None:
-    """Return a contact with an image version, its decisions and measurements; None if the version was deleted."""
-    row = find_version(db, contact_id, version)
-    if row is None:
-        return None
-    rows = db.execute(
-        "SELECT payload FROM decision WHERE contact_id = ? ORDER BY decided_utc_s, seq", (contact_id,)
-    ).fetchall()
-    decisions = tuple(wire.decode(Decision, bytes(row["payload"]), "decision") for row in rows)
-    measurements, image = list_measurements(db, contact_id), decode_image(row)
+def find_stored_contact(db: sqlite3.Connection, contact_id: str, version: int) -> StoredContact:
+    """Return a contact with an image version, its decisions and measurements."""
+    image, measurements = find_image(db, contact_id, version), list_measurements(db, contact_id)
+    decisions = tuple(decisions_on(db, contact_id))
     contact = ExportContact(ImageSideCar.model_validate(side_car(image)), decisions, None, measured_size(measurements))
     return StoredContact(contact, image, _image_lines(measurements))
 

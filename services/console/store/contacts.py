@@ -19,7 +19,7 @@ from sonarpost.messages import Pixels, ReconstructedImage
 from sonarpost.review.objects import AssociationRule
 from sonarpost.review.positions import vehicle_position
 from sonarpost.services.console.store.association import assign_objects
-from sonarpost.services.console.store.database import UNDELIVERED
+from sonarpost.services.console.store.database import UNDELIVERED, NotFoundError
 from sonarpost.services.console.store.related_images import link_related_images
 from sonarpost.services.console.store.serialisers import (
     CONTACT_QUERY,
@@ -28,7 +28,7 @@ from sonarpost.services.console.store.serialisers import (
     NEWER_DETAIL,
     Json,
     contact_json,
-    decode_image,
+    find_image,
     percent_received,
 )
 
@@ -132,10 +132,6 @@ class ContactFilter(BaseModel):
             conditions.append("(" + " OR ".join(f"c.{column} LIKE ? ESCAPE '\\'" for column in columns) + ")")
             values += [pattern] * len(columns)
         return " AND ".join(conditions), values
-
-
-class NotFoundError(BadInputError):
-    """There is no such contact, version or file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,14 +291,6 @@ def find_contact(db: sqlite3.Connection, contact_id: str) -> sqlite3.Row:
     return row
 
 
-def find_version(db: sqlite3.Connection, contact_id: str, version: int) -> sqlite3.Row | None:
-    """Return the row of an image version; None if there is none."""
-    row: sqlite3.Row | None = db.execute(
-        "SELECT * FROM version WHERE contact_id = ? AND version = ?", (contact_id, version)
-    ).fetchone()
-    return row
-
-
 def find_contact_of_image(
     db: sqlite3.Connection, vessel_id: str, vehicle_id: str, image_id: str, utc_s: float
 ) -> str | None:
@@ -351,9 +339,8 @@ def remove_images(db: sqlite3.Connection, now_utc_s: float, retain_days: float, 
     stored = [Stored((str(row[0]), int(row[1])), row[2], row[3], row[4], vehicle_source(row[5])) for row in rows]
     selected = select_for_removal(stored, now_utc_s, retain_days, max_bytes)[:MAX_IMAGES_AT_ONCE]
     for key in selected:
-        row = db.execute("SELECT * FROM version WHERE contact_id = ? AND version = ?", key).fetchone()
         try:
-            payload = wire.encode(without_pixels(decode_image(row)))
+            payload = wire.encode(without_pixels(find_image(db, *key)))
         except BadInputError:
             payload = b""  # it cannot be shown either
         db.execute("UPDATE version SET payload = ?, removed = 1 WHERE contact_id = ? AND version = ?", (payload, *key))

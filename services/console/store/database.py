@@ -191,6 +191,10 @@ _CHANGED: Final = (
 """The changed contacts; an image that answers a request is a layer of its contact."""
 
 
+class NotFoundError(BadInputError):
+    """There is no such contact, version or file."""
+
+
 class Database(SqliteFile):
     """The database of the console.
 

@@ -14,20 +14,19 @@ from sonarpost.messages import Decision, DownlinkState, ReconstructedImage, Verd
 from sonarpost.review.decisions import review_result
 from sonarpost.services.console.store.association import update_decided_on
 from sonarpost.services.console.store.contacts import (
-    NotFoundError,
     find_contact,
     find_contact_of_image,
-    find_version,
 )
 from sonarpost.services.console.store.database import (
     Actor,
     DisplayedImage,
+    NotFoundError,
     add_audit_entry,
     find_record,
     insert_row,
 )
 from sonarpost.services.console.store.requests import check_waiting, is_later_state
-from sonarpost.services.console.store.serialisers import Json, decode_image
+from sonarpost.services.console.store.serialisers import Json, find_image
 
 _COLUMNS: Final = "decision_id vessel_id vehicle_id image_id verdict operator decided_utc_s"
 """Fields of a decision that have a column of their name."""
@@ -103,7 +102,7 @@ def add_decision(
     image = _check_displayed_image(db, contact_id, entered.displayed)
     others = [
         one
-        for one in review_result(_records(db, contact_id)).standing
+        for one in review_result(decisions_on(db, contact_id)).standing
         if one.operator != actor.user and one.verdict != entered.verdict
     ]
     if entered.overrules and not others:
@@ -156,7 +155,7 @@ def undo_decision(
     if displayed.version is not None:
         _check_displayed_image(db, contact_id, displayed)
     undone = find_record(db, "decision", decision_id)
-    records = _records(db, contact_id)
+    records = decisions_on(db, contact_id)
     standing = standing_decisions(db, contact_id)
     own = undone is not None and undone["operator"] == actor.user and not undone["elsewhere"]
     if undone is None or not own or decision_id not in standing:
@@ -196,7 +195,7 @@ def release_decisions(db: sqlite3.Connection, now_utc_s: float, take_back_s: flo
 
 def standing_decisions(db: sqlite3.Connection, contact_id: str) -> list[str]:
     """Return the identifiers of the decisions on a contact that stand, oldest first; see `review_result`."""
-    return [one.decision_id for one in review_result(_records(db, contact_id)).standing]
+    return [one.decision_id for one in review_result(decisions_on(db, contact_id)).standing]
 
 
 def last_own_decision(db: sqlite3.Connection, user: str, since_utc_s: float) -> sqlite3.Row | None:
@@ -331,10 +330,10 @@ def mark_delivered_to_shore(db: sqlite3.Connection, before_utc_s: float) -> None
 
 def _check_displayed_image(db: sqlite3.Connection, contact_id: str, displayed: DisplayedImage) -> ReconstructedImage:
     """Return the displayed image, if it belongs to the contact, so that the audit can show it again."""
-    row = None if displayed.version is None else find_version(db, contact_id, displayed.version)
-    if row is None:
-        raise BadInputError("decision", "version", displayed.version, "a version of this contact's image")
-    image = decode_image(row)
+    try:
+        image = find_image(db, contact_id, displayed.version)
+    except NotFoundError as error:
+        raise BadInputError("decision", "version", displayed.version, "a version of this contact's image") from error
     if image.pixels_sha256 != displayed.sha256:
         raise BadInputError("decision", "sha256", displayed.sha256, f"that of version {displayed.version}")
     return image
@@ -354,7 +353,7 @@ def _add_own_decision(
     fields = {"decision_id": f"d-{uuid.uuid4().hex}", "operator": actor.user, "decided_utc_s": now_utc_s}
     version = displayed.version or row["version"]
     record = Decision.model_validate({**names, **fields, **content, "image_version": version})
-    counting = review_result([*_records(db, row["id"]), record]).counting
+    counting = review_result([*decisions_on(db, row["id"]), record]).counting
     # The vehicle acts on the latest verdict that it receives: a differing verdict of a disputed contact is not sent.
     if counting is not None and counting.verdict != record.verdict and delivery.vehicle != "none":
         delivery = delivery._replace(vehicle="disputed")
@@ -392,7 +391,7 @@ def _insert(
     insert_row(db, "decision", values)
 
 
-def _records(db: sqlite3.Connection, contact_id: str) -> list[Decision]:
+def decisions_on(db: sqlite3.Connection, contact_id: str) -> list[Decision]:
     """Return the decisions on a contact, oldest first."""
     rows = db.execute("SELECT payload FROM decision WHERE contact_id = ? ORDER BY decided_utc_s, seq", (contact_id,))
     return [wire.decode(Decision, bytes(row["payload"]), f"decision on {contact_id}") for row in rows]
@@ -400,7 +399,7 @@ def _records(db: sqlite3.Connection, contact_id: str) -> list[Decision]:
 
 def _update_contact(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> None:
     """Update the columns that depend on the decisions on a contact."""
-    result = review_result(_records(db, contact_id))
+    result = review_result(decisions_on(db, contact_id))
     counting = result.counting
     for decision_id in result.withdrawn:
         db.execute("UPDATE decision SET undone = 1 WHERE decision_id = ?", (decision_id,))

@@ -6,6 +6,7 @@ import math
 import sqlite3
 import uuid
 from collections.abc import Mapping, Sequence
+from itertools import product
 from statistics import fmean, stdev
 from typing import Any, Final
 
@@ -15,14 +16,14 @@ from sonarpost.review.objects import AssociationRule, Look, fuse_positions, look
 from sonarpost.review.positions import LocalFrame, destination, distance_m
 from sonarpost.services.console.store.association import (
     IS_LOOK,
-    join_looks,
+    assign_objects,
     looks_near,
     looks_of_object,
     object_of,
-    separate_look,
+    store_pair,
 )
-from sonarpost.services.console.store.contacts import NotFoundError, find_contact, find_version
-from sonarpost.services.console.store.database import Actor, DisplayedImage, add_audit_entry
+from sonarpost.services.console.store.contacts import find_contact
+from sonarpost.services.console.store.database import Actor, DisplayedImage, NotFoundError, add_audit_entry
 from sonarpost.services.console.store.decisions import (
     DecisionInput,
     DeliveryStates,
@@ -31,7 +32,7 @@ from sonarpost.services.console.store.decisions import (
     standing_decisions,
     undo_decision,
 )
-from sonarpost.services.console.store.serialisers import Json, contact_json, decode_image
+from sonarpost.services.console.store.serialisers import Json, contact_json, find_image
 
 MAX_OBJECT_LOOKS: Final = 50
 """Maximum number of looks of an object that a person joins, that is displayed, and that one verdict decides."""
@@ -89,9 +90,7 @@ def _looks(db: sqlite3.Connection, object_id: str) -> list[Look]:
 
 def _look_json(db: sqlite3.Connection, look: Look) -> dict[str, Any]:
     row = find_contact(db, look.contact_id)
-    newest = find_version(db, look.contact_id, row["version"])
-    assert newest is not None
-    image = decode_image(newest)
+    image = find_image(db, look.contact_id)
     record = image.contact
     names = ("heading_deg", "channel", "pixel_along_m", "pixel_across_m")
     return {
@@ -136,7 +135,10 @@ def split_look(
     others = {look.contact_id for look in _looks(db, object_id)} - {contact_id}
     if object_of(db, contact_id) != object_id or not others:
         raise BadInputError("split", "contact", contact_id, f"one of several looks of object {object_id}")
-    separate_look(db, contact_id, others, rule)
+    for other in others:
+        store_pair(db, contact_id, other, joined=False)
+    db.execute("UPDATE contact SET group_id = NULL WHERE id = ?", (contact_id,))
+    assign_objects(db, [contact_id, *others], rule)
     detail: Json = {"object": object_id, "looks": sorted(others), "new_object": object_of(db, contact_id)}
     add_audit_entry(db, contact_id, actor, "split", now_utc_s, DisplayedImage(), detail)
 
@@ -157,7 +159,9 @@ def merge_objects(
     others = _looks(db, other_id)
     if len(ones) + len(others) > MAX_OBJECT_LOOKS:
         raise BadInputError("merge", "contact", contact_id, f"at most {MAX_OBJECT_LOOKS} looks together")
-    join_looks(db, [one.contact_id for one in ones], [other.contact_id for other in others], rule)
+    for one, other in product(ones, others):
+        store_pair(db, one.contact_id, other.contact_id, joined=True)
+    assign_objects(db, [look.contact_id for look in (*ones, *others)], rule)
     detail: Json = {"object": object_id, "merged_object": other_id, "looks": sorted(o.contact_id for o in others)}
     add_audit_entry(db, contact_id, actor, "merge", now_utc_s, DisplayedImage(), detail)
 

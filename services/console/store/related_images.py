@@ -19,7 +19,7 @@ from sonarpost.codec.region import RegionBox
 from sonarpost.limits import limit
 from sonarpost.messages import Command, Contact, ReconstructedImage
 from sonarpost.modem.interface import RateInfo
-from sonarpost.services.console.store.serialisers import Json, decode_image, versions_json
+from sonarpost.services.console.store.serialisers import Json, find_image, versions_json
 
 EXPAND_FACTOR: Final = 2
 """Ratio of the pixel sizes."""
@@ -132,7 +132,7 @@ def link_related_images(db: sqlite3.Connection, contact_id: str, image: Reconstr
     if row["parent"] is not None or row["seen_utc_s"] is None:
         return
     others = db.execute(
-        "SELECT id, version, review FROM contact"
+        "SELECT id, review FROM contact"
         " WHERE vehicle_id = ? AND seen_utc_s = ? AND vessel_id = ? AND id <> ? AND parent IS NULL"
         " AND lat_deg IS ? AND lon_deg IS ? AND range_m IS ? AND atd_confidence IS ? LIMIT ?",
         (
@@ -142,10 +142,7 @@ def link_related_images(db: sqlite3.Connection, contact_id: str, image: Reconstr
         ),
     ).fetchall()
     for other in others:
-        stored = db.execute(
-            "SELECT * FROM version WHERE contact_id = ? AND version = ?", (other["id"], other["version"])
-        ).fetchone()
-        other_image = decode_image(stored)
+        other_image = find_image(db, other["id"])
         if row["review"] == "unreviewed" and (relation := relation_of(image, other_image)):
             _link(db, contact_id, other["id"], relation)
             return
@@ -169,10 +166,7 @@ def related_images_json(db: sqlite3.Connection, contact_id: str, rates: Mapping[
     for row in rows:
         box: Sequence[int] | None = None
         if row["relation"] == "expand":
-            newest = db.execute(
-                "SELECT * FROM version WHERE contact_id = ? ORDER BY version DESC LIMIT 1", (row["id"],)
-            )
-            box = _box_in_expanded(db, contact_id, decode_image(newest.fetchone()))
+            box = _box_in_expanded(find_image(db, contact_id), find_image(db, row["id"]))
         elif row["relation"] == "region":
             box = _box_of_region(db, contact_id, row["id"])
         images = versions_json(db, row["id"], rates)
@@ -193,13 +187,8 @@ def _box_of_region(db: sqlite3.Connection, contact_id: str, region_id: str) -> S
     return RegionBox(*command.box).pixels(row["height_px"], row["width_px"])
 
 
-def _box_in_expanded(db: sqlite3.Connection, contact_id: str, expanded: ReconstructedImage) -> Sequence[int] | None:
+def _box_in_expanded(image: ReconstructedImage, expanded: ReconstructedImage) -> Sequence[int] | None:
     """Return the box of a contact's image in the expanded image, as that of a region; None if it is not found."""
-    newest = db.execute(
-        "SELECT v.* FROM version v JOIN contact c ON c.id = v.contact_id AND c.version = v.version WHERE c.id = ?",
-        (contact_id,),
-    ).fetchone()
-    image = decode_image(newest)
     if not image.codec or not expanded.codec:
         return None
     place = place_in_expanded(image.pixels.to_array(), expanded.pixels.to_array())

@@ -6,7 +6,7 @@ import sqlite3
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 from pydantic import ValidationError
 
@@ -27,7 +27,7 @@ from sonarpost.services.console.store.database import (
     insert_row,
 )
 from sonarpost.services.console.store.request_results import link_record, request_columns
-from sonarpost.services.console.store.serialisers import Json, decode_image, newest_image
+from sonarpost.services.console.store.serialisers import Json, decode_image, find_image, newest_image
 from sonarpost.wire import first_error
 
 MAX_WAITING: Final = limit(
@@ -63,25 +63,10 @@ _UNSUPPORTED: Final = "unsupported"
 """Reason of a vehicle without a consumer for a kind of command, as op_modem states it."""
 
 
-Obstacle = Literal[
-    "no_downlink",
-    "unsupported",
-    "no_position",
-    "complete",
-    "no_image",
-    "fixed_codec",
-    "despeckling_unknown",
-    "not_despeckled",
-    "here",
-    "related",
-]
-"""Why a kind of request is not possible; docs/specifications/console-api.md explains them."""
-
-
 def find_obstacle(
     db: sqlite3.Connection, row: sqlite3.Row, kind: CommandKind, now_utc_s: float, *, has_downlink: bool
-) -> Obstacle | None:
-    """Return why a kind of request is not possible for a contact; None if it is.
+) -> str | None:
+    """Return why a kind of request is not possible for a contact; None if it is. console-api.md explains the reasons.
 
     Args:
         db: Connection.
@@ -93,7 +78,7 @@ def find_obstacle(
     image = newest_image(row)
     codec, despeckling = image["codec"], image["despeckle_strength"]
     is_new_image, is_original = kind in NEW_IMAGE_KINDS, kind == "original"
-    obstacles: dict[Obstacle, bool] = {
+    obstacles = {
         "no_downlink": not has_downlink,
         "unsupported": _is_unsupported(db, row["vehicle_id"], kind, now_utc_s),
         "no_position": kind == "revisit" and (row["lat_deg"] is None or row["lon_deg"] is None),
@@ -339,9 +324,7 @@ def costs_json(
     db: sqlite3.Connection, row: sqlite3.Row, link: VehicleLink, now_utc_s: float, *, has_downlink: bool
 ) -> list[Json]:
     """Return the cost of each kind of request for a contact, in the order of the page."""
-    image = decode_image(
-        db.execute("SELECT * FROM version WHERE contact_id = ? ORDER BY version DESC LIMIT 1", (row["id"],)).fetchone()
-    )
+    image = find_image(db, row["id"])
     found: list[Json] = []
     for kind in REQUEST_KINDS:
         estimate = estimate_request(db, row, kind, link)

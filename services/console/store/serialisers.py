@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -12,10 +13,9 @@ from sonarpost import wire
 from sonarpost.limits import limit
 from sonarpost.messages import Comment, Decision, ReconstructedImage
 from sonarpost.modem.interface import RateInfo
-from sonarpost.review.costs import airtime_of_frames, least_airtime_s
 from sonarpost.review.image_geometry import contact_box, contact_mark, range_axis
 from sonarpost.review.resolution import CODEBOOK_CODECS, codebook_edge_px, sharp_to_m
-from sonarpost.services.console.store.database import Table
+from sonarpost.services.console.store.database import NotFoundError, Table
 
 Json = dict[str, object]
 Stage = Literal["record", "preview", "part", "sent", "refined"]
@@ -190,6 +190,19 @@ def decode_image(row: sqlite3.Row) -> ReconstructedImage:
     return wire.decode(ReconstructedImage, bytes(row["payload"]), f"contact {row['contact_id']}")
 
 
+def find_image(db: sqlite3.Connection, contact_id: str, version: int | None = None) -> ReconstructedImage:
+    """Return the record of an image version, by default of the newest one.
+
+    Raises:
+        NotFoundError: There is no such version.
+    """
+    sql = "SELECT * FROM version WHERE contact_id = ? AND version = IFNULL(?, version) ORDER BY version DESC LIMIT 1"
+    row = db.execute(sql, (contact_id, version)).fetchone()
+    if row is None:
+        raise NotFoundError("contact", "version", version, f"a version of {contact_id}")
+    return decode_image(row)
+
+
 def _airtime(image: ReconstructedImage, rate: RateInfo | None) -> Json:
     """Return the air time of an image.
 
@@ -199,8 +212,8 @@ def _airtime(image: ReconstructedImage, rate: RateInfo | None) -> Json:
     if rate is None or not (image.frames_received or image.bytes_received):
         return {"airtime_s": None, "airtime_is": None}
     if image.frames_received:
-        return {"airtime_s": airtime_of_frames(image.frames_received, rate), "airtime_is": "estimated"}
-    return {"airtime_s": least_airtime_s(image.bytes_received, rate), "airtime_is": "at_least"}
+        return {"airtime_s": math.ceil(image.frames_received / rate.frames) * rate.airtime_s, "airtime_is": "estimated"}
+    return {"airtime_s": image.bytes_received / rate.packet_bytes * rate.airtime_s, "airtime_is": "at_least"}
 
 
 def versions_json(

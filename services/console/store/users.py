@@ -351,8 +351,3 @@ def login_link(address: str, token: str) -> str:
         token: Token of `Users.make_login_link`.
     """
     return f"{address}login#{token}"
-
-
-def is_equal_secret(given: str, expected: str) -> bool:
-    """Compare two secrets in constant time."""
-    return hmac.compare_digest(given.encode("utf-8", "surrogatepass"), expected.encode())

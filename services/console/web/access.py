@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hmac
 import logging
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -24,10 +25,9 @@ from sonarpost.limits import limit
 from sonarpost.logs import IntervalLog
 from sonarpost.network.connections import TrustedProxies
 from sonarpost.review.measurement import NotMeasurableError
-from sonarpost.services.console.store.contacts import NotFoundError
-from sonarpost.services.console.store.database import Actor, ConsoleSide, Permission
+from sonarpost.services.console.store.database import Actor, ConsoleSide, NotFoundError, Permission
 from sonarpost.services.console.store.decisions import ConflictError
-from sonarpost.services.console.store.users import Session, Users, is_equal_secret
+from sonarpost.services.console.store.users import Session, Users
 from sonarpost.wire import first_error
 
 log = logging.getLogger(__name__)
@@ -203,10 +203,6 @@ class AccessControl:
                 if session is None:  # `LoginLimiter` limits the log-ins
                     return await run_in_threadpool(_with_error_responses, handler, call)
                 return await self._shares.run(session.name, _with_error_responses, handler, call)
-            except TooManyRequestsError:
-                headers = {"Retry-After": str(RETRY_S)}
-                message = f"too many requests at a time: try again in {RETRY_S} s"
-                return error_response(ApiError(429, "too_many", message, headers=headers))
             except ApiError as error:
                 return error_response(error)
 
@@ -222,7 +218,8 @@ class AccessControl:
     def _check(self, request: Request, session: Session | None, permission: Permission | None) -> None:
         if session is None:
             raise ApiError(401, "no_session", "log in first")
-        if request.method == "POST" and not is_equal_secret(request.headers.get("x-csrf-token", ""), session.csrf):
+        given = request.headers.get("x-csrf-token", "").encode("utf-8", "surrogatepass")
+        if request.method == "POST" and not hmac.compare_digest(given, session.csrf.encode()):
             raise ApiError(403, "csrf", "the page has an invalid session token: reload it")
         if permission is not None and not Actor(session.name, session.role, "").may(permission, self._side):
             site = "vessel" if self._side == "vessel" else "shore site"
@@ -336,10 +333,6 @@ def _without_port(host: str) -> str:
     return host.partition(":")[0]
 
 
-class TooManyRequestsError(Exception):
-    """Too many requests of one user are waiting."""
-
-
 class ThreadShares:
     """Runs functions in threads, with a share for each user. Used in the event loop."""
 
@@ -351,11 +344,12 @@ class ThreadShares:
         """Run a function in a thread; return its result.
 
         Raises:
-            TooManyRequestsError: The limit of waiting requests is reached.
+            ApiError: The limit of waiting requests is reached.
         """
         # Requests hold the share of their user; without any it is deleted.
         share = self._shares.setdefault(user, CapacityLimiter(MAX_THREADS_OF_USER))
         if share.statistics().tasks_waiting >= MAX_WAITING_OF_USER:
-            raise TooManyRequestsError
+            message = f"too many requests at a time: try again in {RETRY_S} s"
+            raise ApiError(429, "too_many", message, headers={"Retry-After": str(RETRY_S)})
         async with share:
             return await to_thread.run_sync(lambda: function(*args, **kwargs), limiter=self._threads)

@@ -9,7 +9,7 @@ from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from sonarpost.services.console.state import ConsoleState
-from sonarpost.services.console.store.contacts import NotFoundError
+from sonarpost.services.console.store.database import NotFoundError
 from sonarpost.services.console.store.serialisers import LISTED, Json
 from sonarpost.services.console.store.tracks import all_tracks, newest_status, surveyed_area, tracks_json
 from sonarpost.services.console.web.access import AccessControl, Call

@@ -30,7 +30,7 @@ from sonarpost.review.true_scale import (
 )
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.contact_detail import StoredContact, find_stored_contact
-from sonarpost.services.console.store.contacts import ContactFilter, NotFoundError
+from sonarpost.services.console.store.contacts import ContactFilter
 from sonarpost.services.console.store.serialisers import Json
 from sonarpost.services.console.web.access import AccessControl, ApiError, Call
 from sonarpost.services.console.web.export_routes import SURFACE, DocumentContacts, ExportRoutes
@@ -338,8 +338,6 @@ class ReportRoutes:
         contact_id, version = str(contact["id"]), int(contact["version"])
         with self._state.database.read() as db:
             stored = find_stored_contact(db, contact_id, version)
-        if stored is None:
-            raise NotFoundError("contact", "version", version, f"a version of {contact_id}")
         name = stored.contact.name
         text = "".join(self._parts([ReportContact(detail, stored)], f"Contact {name}"))
         return Response(text, headers=_headers(name.replace("/", "-")))

@@ -48,7 +48,7 @@ from sonarpost.services.console.web.event_stream import EventStream
 from sonarpost.services.console.web.export_routes import ExportRoutes, offered_formats
 from sonarpost.services.console.web.map_routes import MapRoutes
 from sonarpost.services.console.web.report import ReportRoutes
-from sonarpost.services.console.web.session_routes import SessionRoutes, SettingsRoutes
+from sonarpost.services.console.web.session_routes import SessionRoutes
 
 log = logging.getLogger(__name__)
 
@@ -74,7 +74,6 @@ class ConsoleApp:
         routes = [
             Route("/api/info", access.endpoint(self._info)),
             *sessions.routes(access),
-            *SettingsRoutes(users).routes(access),
             *ContactRoutes(state).routes(access),
             *DecisionRoutes(state).routes(access),
             *self._map.routes(access),

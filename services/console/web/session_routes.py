@@ -171,8 +171,18 @@ class _PasswordBody(RequestBody):
     new: str
 
 
+SETTINGS: Final = ("keys", "language", "map", "review", "sort", "theme", "type")
+"""Names of the settings that are stored. The page keeps all others in the browser alone."""
+MAX_VALUE: Final = 100
+"""Characters of a value."""
+
+
+class _SettingsBody(RequestBody):
+    settings: Annotated[dict[str, Annotated[str, Field(max_length=MAX_VALUE)]], Field(max_length=len(SETTINGS))]
+
+
 class SessionRoutes:
-    """Routes of sessions.
+    """Routes of sessions and settings. Every user reads and writes the own settings.
 
     Args:
         tls: Whether the cookie is restricted to TLS.
@@ -194,6 +204,8 @@ class SessionRoutes:
             Route("/api/session", access.endpoint(self._session)),
             access.post("/api/logout", self._logout),
             access.post("/api/password", self._password),
+            Route("/api/settings", access.endpoint(self._read_settings)),
+            access.post("/api/settings", self._write_settings),
         ]
 
     def _login(self, call: Call) -> Response:
@@ -277,39 +289,13 @@ class SessionRoutes:
         log.info("Password changed", extra=kv(user=name, address=call.address))
         return Response(status_code=204)
 
+    def _read_settings(self, call: Call) -> Response:
+        return JSONResponse({"names": list(SETTINGS), "settings": self._users.settings(call.actor.user)})
 
-SETTINGS: Final = ("keys", "language", "map", "review", "sort", "theme", "type")
-"""Names of the settings that are stored. The page keeps all others in the browser alone."""
-MAX_VALUE: Final = 100
-"""Characters of a value."""
-
-
-class _SettingsBody(RequestBody):
-    settings: Annotated[dict[str, Annotated[str, Field(max_length=MAX_VALUE)]], Field(max_length=len(SETTINGS))]
-
-
-class SettingsRoutes:
-    """Routes of settings. Every user reads and writes the own ones."""
-
-    def __init__(self, users: Users) -> None:
-        self._users = users
-
-    def routes(self, access: AccessControl) -> list[Route]:
-        """Return the routes."""
-        return [
-            Route("/api/settings", access.endpoint(self._read)),
-            access.post("/api/settings", self._write),
-        ]
-
-    def _read(self, call: Call) -> Response:
-        assert call.session is not None
-        return JSONResponse({"names": list(SETTINGS), "settings": self._users.settings(call.session.name)})
-
-    def _write(self, call: Call) -> Response:
-        assert call.session is not None
+    def _write_settings(self, call: Call) -> Response:
         values = call.parse_body(_SettingsBody).settings
         for name in values:
             if name not in SETTINGS:
                 raise ApiError(400, "bad_request", f"unknown setting; known: {', '.join(SETTINGS)}", f"settings.{name}")
-        self._users.store_settings(call.session.name, values)
+        self._users.store_settings(call.actor.user, values)
         return Response(status_code=204)

@@ -1,5 +1,6 @@
 """The chain of places between an operator and the vehicles."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -7,7 +8,7 @@ import pytest
 
 from sonarpost.messages import Health
 from sonarpost.monitoring.fleet import ServiceStatus
-from sonarpost.services.console.chain import ChainHistory, ChainLink, HeardVehicle, RouterState, chain_links
+from sonarpost.services.console.chain import ChainHistory, ChainLink, RouterState, chain_links
 
 VESSEL = "vessel-1"
 NOW_S = 10_000.0
@@ -37,12 +38,12 @@ def status(
 
 
 ALL = (status("console"), status("op_modem", modem_ready=1.0), status("decompressor"))
-UUV_1 = HeardVehicle("uuv-1", 3.0)
+UUV_1 = {"uuv-1": 3.0}
 
 
 def links(
     services: tuple[ServiceStatus, ...] = ALL,
-    vehicles: tuple[HeardVehicle, ...] = (UUV_1,),
+    vehicles: Mapping[str, float] = UUV_1,
     router: RouterState | None = ROUTER,
     side: Any = "vessel",
     expected: tuple[str, ...] = (),
@@ -108,17 +109,17 @@ def test_services_have_time_to_appear_after_the_connection():
 
 
 def test_silent_vehicle_is_named_with_the_time_of_its_last_frame():
-    chain = links(vehicles=(UUV_1, HeardVehicle("uuv-2", 121.0)))
+    chain = links(vehicles=UUV_1 | {"uuv-2": 121.0})
     assert chain["uuv-1"].state == "ok"
     silent = chain["uuv-2"]
     assert (silent.state, silent.reason, silent.since_utc_s) == ("degraded", "no_frames", NOW_S - 121.0)
 
 
 def test_vehicles_before_their_first_frame_are_waited_for():
-    assert links(vehicles=(), expected=("uuv-3",))["uuv-3"] == ChainLink(
+    assert links(vehicles={}, expected=("uuv-3",))["uuv-3"] == ChainLink(
         "vehicle", "uuv-3", "waiting", since_utc_s=9_000.0
     )
-    assert links(vehicles=())[""].state == "waiting"
+    assert links(vehicles={})[""].state == "waiting"
 
 
 def test_degraded_console_is_named_unless_the_router_is_the_reason():
@@ -130,7 +131,7 @@ def test_degraded_console_is_named_unless_the_router_is_the_reason():
 def test_shore_site_and_console_without_a_network():
     c2 = ServiceStatus("vessel-1", "c2", status("c2").health, 1.0, True)
     assert list(links((c2,), side="shore")) == ["server", "router", "c2"]
-    assert list(links((), (), router=None)) == ["server"]
+    assert list(links((), {}, router=None)) == ["server"]
 
 
 def test_time_of_a_state_is_that_of_its_first_observation():

@@ -13,8 +13,8 @@ from sonarpost.services.console.web.access import (
     MAX_THREADS,
     MAX_THREADS_OF_USER,
     MAX_WAITING_OF_USER,
+    ApiError,
     ThreadShares,
-    TooManyRequestsError,
 )
 from sonarpost.services.console.web.export_routes import _ExportQueue
 
@@ -31,7 +31,7 @@ def test_further_requests_of_a_user_wait_and_are_limited():
         for _ in range(MAX_THREADS_OF_USER):
             assert await asyncio.to_thread(running.acquire, timeout=120)
         assert await shares.run("bo", str, 1) == "1"
-        with pytest.raises(TooManyRequestsError):
+        with pytest.raises(ApiError, match="too many requests"):
             await shares.run("anna", str, 1)
         assert not running.acquire(blocking=False)
         leave.set()
