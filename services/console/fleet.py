@@ -138,10 +138,6 @@ class FleetMonitor:
         with self._lock:
             return {name: max(0.0, now - link.received_s) for name, link in sorted(self._links.items())}
 
-    def service_list(self) -> list[Json]:
-        """Return the state of all services."""
-        return [_service_json(status) for status in self.services.state(time.monotonic()).services]
-
 
 def unknown_vehicle_json(name: str) -> Json:
     """Return the state of a vehicle without received frames."""
@@ -237,10 +233,11 @@ def fleet_json(
                 "open_requests": open_requests.get(name, 0),
             }
         )
+    services = monitor.services.state(time.monotonic()).services
     links = chain_links(
         config.role,
         router,
-        monitor.services.state(time.monotonic()).services,
+        services,
         monitor.heard_vehicles(),
         sorted(set(config.vehicles.values())),
         now_utc_s=now_utc_s,
@@ -250,7 +247,7 @@ def fleet_json(
         "now_utc_s": now_utc_s,
         "listening_since_utc_s": router and router.listening_since_utc_s,
         "chain": [asdict(link) for link in monitor.chain_history.with_times(links, now_utc_s)],
-        "services": [*monitor.service_list()],
+        "services": [_service_json(status) for status in services],
         "vehicles": [*vehicles],
     }
 

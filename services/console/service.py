@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeVar
+from functools import cache
+from typing import Protocol, TypeVar
 
 import zenoh
 from typing_extensions import override
@@ -32,11 +33,11 @@ from sonarpost.messages import (
 )
 from sonarpost.modem.registry import modem_driver
 from sonarpost.network.connections import ConnectionLimits, TrustedProxies
+from sonarpost.registry import Registry
 from sonarpost.runtime.retention import Retention
 from sonarpost.runtime.service import Service, UnitOfWork
 from sonarpost.services.console.chain import RouterState
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.known_objects import Watch, watches
 from sonarpost.services.console.state import ConsoleState
 from sonarpost.services.console.store.database import (
     DATABASE_NAME,
@@ -69,6 +70,28 @@ _CURSOR = "cursor"
 SHORE_DELIVERY_MARGIN_S = 2.0
 """Age that a decision must have before the relay's health proves its delivery: health is older than its arrival."""
 R = TypeVar("R", bound=Record)
+
+
+class Watch(Protocol):
+    """Adds sealed contacts with known objects to the queue of a console: see `watches`.
+
+    It is created with the state of the console, the share of such contacts, and a function to count them.
+    """
+
+    def start(self) -> None:
+        """Start to add contacts and to answer their requests."""
+
+    def stop(self) -> None:
+        """Stop."""
+
+    def contact_arrived(self, image: ReconstructedImage, now_s: float) -> None:
+        """Note a new contact of a vehicle; `now_s` is monotonic."""
+
+
+@cache
+def watches() -> Registry[Callable[..., Watch]]:
+    """Return the kinds of watch: see `sonarpost.registry`. The group of entry points is `sonarpost.watches`."""
+    return Registry("sonarpost.watches", "a class of watches", lambda found, _: callable(found), {})
 
 
 class ConsoleService(Service[ConsoleConfig]):
@@ -373,7 +396,7 @@ class ConsoleService(Service[ConsoleConfig]):
         return batch
 
     def _store_batch(self, batch: Sequence[ReconstructedImage | Decision]) -> None:
-        """Store records in halves down to one that fails, which is quarantined.
+        """Store records, after a failure each by itself; one that fails then is quarantined.
 
         Raises:
             OSError, MemoryError, DeliveryError: A failure that concerns no single record, for example a full disk.
@@ -387,10 +410,9 @@ class ConsoleService(Service[ConsoleConfig]):
                 raise
             if len(batch) == 1:
                 self._quarantine(batch[0], error)
-                return
-            half = len(batch) // 2
-            self._store_batch(batch[:half])
-            self._store_batch(batch[half:])
+            else:
+                for record in batch:
+                    self._store_batch([record])
         else:
             for name, number in (
                 ("images_taken", new),

@@ -154,9 +154,12 @@ class ConsoleState:
 
     def apply_downlink_state(self, state: DownlinkState) -> None:
         """Update the delivery of a decision or request to a vehicle."""
-        apply = decisions.apply_downlink_state if state.kind == "decision" else requests.apply_downlink_state
         with self.database.transaction() as db:
-            apply(db, state)
+            if state.kind == "decision":
+                decisions.apply_downlink_state(db, state)
+            else:
+                progress = state.state, state.reason, state.times_sent, state.changed_utc_s
+                requests.update_request_state(db, state.record_id, *progress)
 
     def apply_tasking_state(self, state: TaskingState) -> None:
         """Update the delivery of a request or comment to a vessel."""
@@ -358,9 +361,6 @@ class ConsoleState:
 
     def reveal(self) -> None:
         """Reveal the objects of contacts whose decision can no longer be taken back."""
-        with self.database.read() as db:
-            if not known_truth.has_unrevealed(db):
-                return
         with self.database.transaction() as db:
             known_truth.reveal(db, self.clock(), self.config.take_back_s)
 

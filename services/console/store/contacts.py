@@ -253,14 +253,14 @@ def list_contacts(db: sqlite3.Connection, query: ContactFilter) -> Json:
     }
 
 
-def list_versions(db: sqlite3.Connection, query: ContactFilter, limit: int = -1) -> list[tuple[str, int]]:
+def list_versions(db: sqlite3.Connection, query: ContactFilter) -> list[tuple[str, int]]:
     """Return identifier and newest version of the filtered contacts, by the time of their first frame."""
     condition, values = query.where()
-    order = "ORDER BY c.first_frame_utc_s, c.id LIMIT ?"
+    order = "ORDER BY c.first_frame_utc_s, c.id"
     # A sealed contact is listed like all others until its decision can no longer be taken back.
     listed = "(c.sealed = 0 OR c.review = 'unreviewed' OR c.id IN (SELECT contact_id FROM decision WHERE sent = 0))"
     sql = f"SELECT c.id, c.version FROM contact c WHERE {listed} AND {condition} {order}"  # noqa: S608
-    rows = db.execute(sql, (*values, limit))
+    rows = db.execute(sql, values)
     return [(str(row["id"]), int(row["version"])) for row in rows]
 
 

@@ -14,7 +14,7 @@ from sonarpost import wire
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError
 from sonarpost.limits import limit
-from sonarpost.messages import Command, CommandKind, Comment, Decision, DownlinkState, ReconstructedImage, TaskingState
+from sonarpost.messages import Command, CommandKind, Comment, Decision, ReconstructedImage, TaskingState
 from sonarpost.modem.interface import RateInfo
 from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestCost, RequestEstimate, expected_arrival, request_cost
 from sonarpost.review.resolution import detail_px, pixel_m, sharp_to_m
@@ -210,11 +210,6 @@ def update_request_state(
         "UPDATE request SET state = ?, reason = ?, times_sent = ?, changed_utc_s = ? WHERE command_id = ?",
         (state, reason, row["times_sent"] if times_sent is None else times_sent, utc_s, command_id),
     )
-
-
-def apply_downlink_state(db: sqlite3.Connection, state: DownlinkState) -> None:
-    """Update the delivery of a request to the vehicle."""
-    update_request_state(db, state.record_id, state.state, state.reason, state.times_sent, state.changed_utc_s)
 
 
 def apply_tasking_state(db: sqlite3.Connection, state: TaskingState) -> None:

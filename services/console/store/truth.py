@@ -87,12 +87,6 @@ def truth_json(db: sqlite3.Connection, contact_id: str) -> Json | None:
     return {"is_mine_like": bool(row["is_mine_like"]), "label": row["label"], "sealed": bool(row["sealed"])}
 
 
-def has_unrevealed(db: sqlite3.Connection) -> bool:
-    """Return whether a contact with a decision has an object that was not published."""
-    sql = "SELECT 1 FROM truth t JOIN decision d USING (contact_id) WHERE t.revealed_utc_s IS NULL LIMIT 1"
-    return db.execute(sql).fetchone() is not None
-
-
 def reveal(db: sqlite3.Connection, now_utc_s: float, take_back_s: float) -> None:
     """Mark the objects that may be shown since the last call."""
     sql = f"SELECT * FROM ({_SCORED}) WHERE contact_id IN (SELECT contact_id FROM truth WHERE revealed_utc_s IS NULL)"  # noqa: S608

@@ -58,6 +58,10 @@ MAX_NAME: Final = 41
 """Longer than the longest name of a user."""
 
 
+Buckets = Mapping[tuple[str, ...], Rate]
+"""Rates of token buckets by their names."""
+
+
 class LoginLimiter:
     """Limits wrong passwords without locking users out.
 
@@ -76,7 +80,7 @@ class LoginLimiter:
         """Time at which a bucket is full again, by name; full buckets are deleted."""
         self._checks = {known: threading.BoundedSemaphore(MAX_CHECKS) for known in (True, False)}
 
-    def buckets_of_login(self, user: str, address: str, device: str | None) -> Mapping[tuple[str, ...], Rate]:
+    def buckets_of_login(self, user: str, address: str, device: str | None) -> Buckets:
         """Return the buckets of a log-in.
 
         Args:
@@ -93,16 +97,8 @@ class LoginLimiter:
             ("user", user): RATE_OF_USER,
         }
 
-    def buckets_of_session(self, token: str) -> Mapping[tuple[str, ...], Rate]:
-        """Return the buckets of a password change; an unattended page could be used to guess the password."""
-        return {("session", token): RATE_OF_SOURCE}
-
-    def buckets_of_link(self, address: str) -> Mapping[tuple[str, ...], Rate]:
-        """Return the buckets of a log-in link from a network address, or group of addresses."""
-        return {("link at address", address): RATE_OF_ADDRESS}
-
     @contextmanager
-    def attempt(self, buckets: Mapping[tuple[str, ...], Rate], *, known: bool) -> Iterator[Callable[[], None]]:
+    def attempt(self, buckets: Buckets, *, known: bool) -> Iterator[Callable[[], None]]:
         """Charge an attempt and limit the number of checks. Yields a function that refunds the attempt.
 
         Raises:
@@ -123,7 +119,7 @@ class LoginLimiter:
         finally:
             self._checks[known].release()
 
-    def _charge(self, buckets: Mapping[tuple[str, ...], Rate]) -> float:
+    def _charge(self, buckets: Buckets) -> float:
         """Charge all buckets and return 0; if one is empty, charge none and return the time to wait."""
         with self._lock:
             now_s = self._clock()
@@ -138,7 +134,7 @@ class LoginLimiter:
             self._full_at_s |= charged
             return 0.0
 
-    def _refund(self, buckets: Mapping[tuple[str, ...], Rate]) -> None:
+    def _refund(self, buckets: Buckets) -> None:
         with self._lock:
             for name, rate in buckets.items():
                 if name in self._full_at_s:
@@ -225,7 +221,8 @@ class SessionRoutes:
 
     def _login_link(self, call: Call) -> Response:
         body = call.parse_body(_LinkBody)
-        with self._limiter.attempt(self._limiter.buckets_of_link(address_group(call.address)), known=False) as refund:
+        buckets: Buckets = {("link at address", address_group(call.address)): RATE_OF_ADDRESS}
+        with self._limiter.attempt(buckets, known=False) as refund:
             state, name = self._users.use_login_link(body.token)
             if state != "valid":
                 log.warning("Log-in link refused", extra=kv(user=name, state=state, address=call.address))
@@ -280,7 +277,8 @@ class SessionRoutes:
         if not MIN_PASSWORD <= len(body.new) <= MAX_PASSWORD:
             message = f"a password has {MIN_PASSWORD} to {MAX_PASSWORD} characters; this one has {len(body.new)}"
             raise ApiError(400, "bad_request", message, "new")
-        with self._limiter.attempt(self._limiter.buckets_of_session(call.session.token), known=False) as refund:
+        # An unattended page could be used to guess the password.
+        with self._limiter.attempt({("session", call.session.token): RATE_OF_SOURCE}, known=False) as refund:
             if not self._users.verify_password(name, body.old):
                 log.warning("Password change refused", extra=kv(user=name, address=call.address))
                 raise ApiError(403, "wrong_login", "this is not your current password", "old")

@@ -7,7 +7,7 @@ from builders.console import FIRST_UTC_S, Clock, contact_ids, image_record
 
 from sonarpost.extensions.training import sealed_images
 from sonarpost.extensions.training.calibrated_watch import DELAY_S, CalibratedWatch
-from sonarpost.services.console.known_objects import watches
+from sonarpost.services.console.service import watches
 from sonarpost.services.console.store.contacts import ContactFilter
 
 

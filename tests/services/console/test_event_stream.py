@@ -101,17 +101,6 @@ def test_number_of_streams_of_a_user_is_limited_over_all_sessions_and_in_total(
     eventually(is_accepted, what="another stream")
 
 
-def test_unhandled_exception_is_logged_and_answered(console, monkeypatch, caplog):
-    def fail(_query):
-        raise RuntimeError("internal detail")
-
-    monkeypatch.setattr(console.state, "list_contacts", fail)
-    answer = console.browser("watch").get("/api/contacts")
-    assert (answer.status_code, answer.json()["error"]["code"]) == (500, "defect")
-    assert "internal detail" in caplog.text
-    assert "internal detail" not in answer.text
-
-
 def test_large_events_do_not_fill_the_memory():
     hub = EventHub()
     for number in range(40):

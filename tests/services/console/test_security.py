@@ -301,7 +301,7 @@ def test_no_hostile_request_is_an_error_of_the_server(with_contact, caplog, user
 
 def test_unexpected_exceptions_are_logged_once_an_interval(with_contact, caplog, monkeypatch):
     def fail(*_arguments):
-        raise ValueError("x")
+        raise ValueError("internal detail")
 
     monkeypatch.setattr(with_contact.state, "list_contacts", fail)
     anna = with_contact.browser("anna")
@@ -311,6 +311,8 @@ def test_unexpected_exceptions_are_logged_once_an_interval(with_contact, caplog,
         assert (answer.status_code, answer.json()["error"]["code"]) == (500, "defect")
     [line] = [record for record in caplog.records if record.levelno >= logging.ERROR]
     assert "in fail" in str(line.exc_text)
+    assert "internal detail" in str(line.exc_text)
+    assert "internal detail" not in answer.text
 
 
 def test_tiles_are_served_from_their_folder(make_console, tmp_path):

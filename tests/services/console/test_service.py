@@ -41,7 +41,6 @@ from sonarpost.messages import (
     Relayed,
     TaskingState,
 )
-from sonarpost.runtime.process import main
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service
 from sonarpost.services.console.config import ConsoleConfig
@@ -421,13 +420,6 @@ def test_missing_certificate_and_occupied_port_are_errors(platform, start):
 
 def test_health_and_liveliness_token(start, check_monitoring):
     check_monitoring(start())
-
-
-def test_invalid_configuration_ends_the_process(tmp_path, capsys):
-    path = tmp_path / "vessel.toml"
-    path.write_text('[platform]\nid = "vessel-1"\n[console]\nhost = "0.0.0.0"\n')
-    assert main(ConsoleService, ConsoleConfig, ["--config", str(path)]) == 2
-    assert "passwords are sent over this connection" in capsys.readouterr().err
 
 
 def test_delivery_to_shore_with_the_real_relay(runner, start, client, platform, log_in):
