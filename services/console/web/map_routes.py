@@ -40,7 +40,7 @@ class MapRoutes:
         """Return the routes."""
         return [
             Route("/api/fleet", access.endpoint(lambda _: JSONResponse(self._state.fleet_state()))),
-            Route("/api/map", access.endpoint(lambda _: JSONResponse(map_json(self._state)))),
+            Route("/api/map", access.endpoint(lambda _: JSONResponse(self._map()))),
             Route("/api/map/tracks", access.endpoint(lambda _: JSONResponse(self._tracks()))),
             Route("/tiles/{z:number}/{x:number}/{y:number}.png", access.endpoint(self._tile)),
         ]
@@ -51,6 +51,28 @@ class MapRoutes:
             return None
         levels = {"min_zoom": min(self._zoom_levels), "max_zoom": max(self._zoom_levels)}
         return {"url": "/tiles/{z}/{x}/{y}.png", **levels}
+
+    def _map(self) -> Json:
+        """Return all contacts with a position, and the vessel; WGS 84 positions in degrees.
+
+        A contact is a list of the values that `columns` names: a mission has many thousands of them.
+        """
+        with self._state.database.read() as db:
+            rows = db.execute(
+                f"SELECT {', '.join(_COLUMNS.values())} FROM contact c"  # noqa: S608  constants only
+                f" WHERE {LISTED} AND c.lat_deg IS NOT NULL AND c.lon_deg IS NOT NULL ORDER BY c.id"
+            ).fetchall()
+            total = db.execute(f"SELECT COUNT(*) FROM contact c WHERE {LISTED}").fetchone()[0]  # noqa: S608
+        config = self._state.config
+        return {
+            "columns": list(_COLUMNS),
+            "contacts": [tuple(row) for row in rows],
+            "unlocated": total - len(rows),
+            "vessel": None
+            if config.vessel_lat_deg is None
+            else {"lat_deg": config.vessel_lat_deg, "lon_deg": config.vessel_lon_deg},
+            "ring_m": list(config.ring_m),
+        }
 
     def _tracks(self) -> Json:
         """Return the tracks of the vehicles, and the area that they have surveyed together."""
@@ -75,26 +97,3 @@ def _zoom_levels(folder: Path | None) -> list[int]:
     if folder is None or not folder.is_dir():
         return []
     return sorted(int(path.name) for path in folder.iterdir() if path.is_dir() and path.name.isdecimal())
-
-
-def map_json(state: ConsoleState) -> Json:
-    """Return all contacts with a position, and the vessel; WGS 84 positions in degrees.
-
-    A contact is a list of the values that `columns` names: a mission has many thousands of them.
-    """
-    with state.database.read() as db:
-        rows = db.execute(
-            f"SELECT {', '.join(_COLUMNS.values())} FROM contact c"  # noqa: S608  constants only
-            f" WHERE {LISTED} AND c.lat_deg IS NOT NULL AND c.lon_deg IS NOT NULL ORDER BY c.id"
-        ).fetchall()
-        total = db.execute(f"SELECT COUNT(*) FROM contact c WHERE {LISTED}").fetchone()[0]  # noqa: S608
-    config = state.config
-    return {
-        "columns": list(_COLUMNS),
-        "contacts": [tuple(row) for row in rows],
-        "unlocated": total - len(rows),
-        "vessel": None
-        if config.vessel_lat_deg is None
-        else {"lat_deg": config.vessel_lat_deg, "lon_deg": config.vessel_lon_deg},
-        "ring_m": list(config.ring_m),
-    }
