@@ -29,7 +29,6 @@ from sonarpost.services.console.store import (
     contacts,
     decisions,
     objects,
-    request_results,
     requests,
     tracks,
 )
@@ -52,7 +51,7 @@ from sonarpost.services.console.store.database import (
     unsent_records,
 )
 from sonarpost.services.console.store.decisions import DecisionInput, DeliveryStates
-from sonarpost.services.console.store.requests import VehicleLink, costs_json, estimate_request
+from sonarpost.services.console.store.requests import VehicleLink, costs_json
 from sonarpost.services.console.store.serialisers import RECORD_JSON, Json, contact_json, find_image
 from sonarpost.services.console.store.truth import Truth
 
@@ -132,8 +131,8 @@ class ConsoleState:
                     decisions.attach_waiting_records(db, contact_id, now)
                     if image.image_id in truths:
                         known_truth.add_truth(db, contact_id, truths[image.image_id], now)
-                for changed in request_results.contacts_with_requests(db, contact_id):
-                    request_results.update_results(db, changed, now)
+                for changed in requests.contacts_with_requests(db, contact_id):
+                    requests.update_results(db, changed, now)
         return count
 
     def store_decision(self, record: Decision) -> bool:
@@ -145,7 +144,7 @@ class ConsoleState:
     def store_comment(self, record: Comment) -> None:
         """Store a comment from the shore site."""
         with self.database.transaction() as db:
-            requests.store_received_comment(db, record)
+            decisions.store_received_comment(db, record)
 
     def store_status(self, record: ReceivedStatus) -> None:
         """Store the status of a vehicle. The pages show it with the next fleet event."""
@@ -164,7 +163,10 @@ class ConsoleState:
     def apply_tasking_state(self, state: TaskingState) -> None:
         """Update the delivery of a request or comment to a vessel."""
         with self.database.transaction() as db:
-            requests.apply_tasking_state(db, state)
+            if state.kind == "command":
+                requests.update_request_state(db, state.record_id, state.state, state.reason, None, state.changed_utc_s)
+            else:
+                decisions.update_comment_state(db, state.record_id, state.state, state.reason)
 
     def apply_acknowledgement(self, table: Table, record_id: str, consumer: str, reason: str | None) -> None:
         """Update a record after a consumer has stored it (`reason` None) or refused it."""
@@ -176,7 +178,7 @@ class ConsoleState:
                 state = "asked" if reason is None else "refused"
                 requests.update_request_state(db, record_id, state, reason or "", None, now)
             elif reason is not None:
-                requests.refuse_comment(db, record_id, reason)
+                decisions.update_comment_state(db, record_id, "refused", reason)
 
     def mark_delivered_to_shore(self, before_utc_s: float) -> None:
         """Mark decisions that the relay stored before a time as delivered to shore."""
@@ -383,19 +385,16 @@ class ConsoleState:
         Raises:
             BadInputError: The request is not possible, or one of this kind is in progress.
         """
-        now = self.clock()
-        length = (arguments or {}).get("stream_bytes")
-        stream_bytes = length if isinstance(length, int) else None
         with self.database.transaction() as db:
             row = contacts.find_contact(db, contact_id)
             command_id = requests.add_request(
                 db,
-                contact_id,
+                row,
                 kind,
                 airtime_s,
                 actor,
-                now,
-                estimate=estimate_request(db, row, kind, self._link_to(row["vehicle_id"]), stream_bytes),
+                self.clock(),
+                link=self._link_to(row["vehicle_id"]),
                 arguments=arguments or {},
                 has_downlink=self._has_downlink,
             )
@@ -405,7 +404,7 @@ class ConsoleState:
         """Store a comment to send; return it."""
         self.image(contact_id, record.image_version)
         with self.database.transaction() as db:
-            requests.add_comment(db, contact_id, record, actor)
+            decisions.add_comment(db, contact_id, record, actor)
         return self._record_json("comment", record.comment_id)
 
     def measure(self, contact_id: str, line: Line, actor: Actor, *, keep: bool) -> Json:

@@ -1,4 +1,4 @@
-"""Decisions in the database: insertion, undo, and their delivery to shore site and vehicle."""
+"""Decisions and comments in the database: insertion, undo, and their delivery to shore site, vehicle and vessel."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Final, NamedTuple
 
 from sonarpost import wire
 from sonarpost.errors import BadInputError, SonarpostError
-from sonarpost.messages import Decision, DownlinkState, ReconstructedImage, Verdict
+from sonarpost.limits import limit
+from sonarpost.messages import Comment, Decision, DownlinkState, ReconstructedImage, Verdict
 from sonarpost.review.decisions import review_result
 from sonarpost.services.console.store.association import update_decided_on
 from sonarpost.services.console.store.contacts import (
@@ -25,9 +26,12 @@ from sonarpost.services.console.store.database import (
     find_record,
     insert_row,
 )
-from sonarpost.services.console.store.requests import check_waiting, is_later_state
+from sonarpost.services.console.store.requests import is_later_state
 from sonarpost.services.console.store.serialisers import Json, find_image
 
+MAX_WAITING: Final = limit(
+    1000, "records", "shares", "the console's records", "vessel", "decisions before images; comments", "it is refused"
+)
 _COLUMNS: Final = "decision_id vessel_id vehicle_id image_id verdict operator decided_utc_s"
 """Fields of a decision that have a column of their name."""
 
@@ -263,6 +267,55 @@ def store_received_decision(db: sqlite3.Connection, record: Decision, now_utc_s:
     if contact_id is not None:
         _update_contact(db, contact_id, now_utc_s)
     return True
+
+
+def add_comment(db: sqlite3.Connection, contact_id: str, record: Comment, actor: Actor) -> None:
+    """Store a comment of this console."""
+    _insert_comment(db, contact_id, record, "waiting")
+    detail = record.model_dump(include={"comment_id", "verdict", "confidence", "mlo_class", "remark"})
+    displayed = DisplayedImage(record.image_version)
+    add_audit_entry(db, contact_id, actor, "comment", record.commented_utc_s, displayed, detail)
+
+
+def store_received_comment(db: sqlite3.Connection, record: Comment) -> None:
+    """Store a comment from the shore site. A comment without its image is kept until the image arrives.
+
+    Raises:
+        BadInputError: Too many comments wait for their images.
+    """
+    if find_record(db, "comment", record.comment_id) is not None:
+        return
+    contact_id = find_contact_of_image(db, record.vessel_id, record.vehicle_id, record.image_id, record.commented_utc_s)
+    if contact_id is None:
+        check_waiting(db, record)
+    _insert_comment(db, contact_id or "", record, None)
+
+
+def check_waiting(db: sqlite3.Connection, record: Decision | Comment) -> None:
+    """Raise `BadInputError` if too many decisions or comments of a vessel wait for their images."""
+    count = f"SELECT COUNT(*) FROM {record.TYPE} WHERE contact_id = '' AND vessel_id = ?"  # noqa: S608  constants only
+    if db.execute(count, (record.vessel_id,)).fetchone()[0] >= MAX_WAITING:
+        raise BadInputError(record.TYPE, "image_id", record.image_id, f"an image; {MAX_WAITING} others have none yet")
+
+
+def _insert_comment(db: sqlite3.Connection, contact_id: str, record: Comment, state: str | None) -> None:
+    values: Json = {
+        **{name: getattr(record, name) for name in ("comment_id", "vessel_id", "vehicle_id", "image_id")},
+        "contact_id": contact_id,
+        "state": state,
+        "payload": wire.encode(record),
+        "sent": int(state is None),
+    }
+    insert_row(db, "comment", values)
+    db.execute("UPDATE contact SET commented = 1 WHERE id = ?", (contact_id,))
+
+
+def update_comment_state(db: sqlite3.Connection, comment_id: str, state: str, reason: str) -> None:
+    """Update the delivery of a comment to the vessel; the first final state stays."""
+    db.execute(
+        "UPDATE comment SET state = ?, reason = ? WHERE comment_id = ? AND state NOT IN ('delivered', 'refused', ?)",
+        (state, reason, comment_id, state),
+    )
 
 
 def attach_waiting_records(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> None:

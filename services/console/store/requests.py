@@ -1,4 +1,4 @@
-"""Requests to vehicles with their costs, and comments from the shore site, in the database, and their delivery."""
+"""Requests to vehicles with their costs and results, and comments from the shore site: storage, delivery."""
 
 from __future__ import annotations
 
@@ -11,14 +11,20 @@ from typing import Final
 from pydantic import ValidationError
 
 from sonarpost import wire
+from sonarpost.codec.region import RegionBox
 from sonarpost.codec.registry import default_registry
 from sonarpost.errors import BadInputError
-from sonarpost.limits import limit
-from sonarpost.messages import Command, CommandKind, Comment, Decision, ReconstructedImage, TaskingState
+from sonarpost.messages import Command, CommandKind, ReconstructedImage
 from sonarpost.modem.interface import RateInfo
-from sonarpost.review.costs import NEW_IMAGE_KINDS, RequestCost, RequestEstimate, expected_arrival, request_cost
+from sonarpost.review.costs import (
+    NEW_IMAGE_KINDS,
+    LinkRecord,
+    RequestCost,
+    RequestEstimate,
+    expected_arrival,
+    request_cost,
+)
 from sonarpost.review.resolution import detail_px, pixel_m, sharp_to_m
-from sonarpost.services.console.store.contacts import find_contact, find_contact_of_image
 from sonarpost.services.console.store.database import (
     Actor,
     DisplayedImage,
@@ -26,13 +32,9 @@ from sonarpost.services.console.store.database import (
     find_record,
     insert_row,
 )
-from sonarpost.services.console.store.request_results import link_record, request_columns
 from sonarpost.services.console.store.serialisers import Json, decode_image, find_image, newest_image
 from sonarpost.wire import first_error
 
-MAX_WAITING: Final = limit(
-    1000, "records", "shares", "the console's records", "vessel", "decisions before images; comments", "it is refused"
-)
 REQUEST_KINDS: Final[tuple[CommandKind, ...]] = (
     "refine",
     "region",
@@ -121,13 +123,13 @@ def is_pending(row: sqlite3.Row, now_utc_s: float) -> bool:
 
 def add_request(
     db: sqlite3.Connection,
-    contact_id: str,
+    row: sqlite3.Row,
     kind: CommandKind,
     airtime_s: float | None,
     actor: Actor,
     now_utc_s: float,
     *,
-    estimate: RequestEstimate,
+    link: VehicleLink,
     has_downlink: bool,
     arguments: Mapping[str, object],
 ) -> str:
@@ -135,19 +137,19 @@ def add_request(
 
     Args:
         db: Connection in a transaction.
-        contact_id: The contact.
+        row: The contact.
         kind: Kind of the request.
         airtime_s: The displayed estimate, for the audit.
         actor: The user.
         now_utc_s: Present time.
-        estimate: The present estimate.
+        link: The present link to the vehicle.
         has_downlink: Whether this console can send requests to vehicles.
         arguments: Further fields of the command: `box` and `stream_bytes`.
 
     Raises:
         BadInputError: The request is not possible, or one of this kind has no result yet.
     """
-    row = find_contact(db, contact_id)
+    contact_id = row["id"]
     if obstacle := find_obstacle(db, row, kind, now_utc_s, has_downlink=has_downlink):
         raise BadInputError("request", "kind", kind, f"another kind: {obstacle}")
     earlier = db.execute("SELECT * FROM request WHERE contact_id = ? AND kind = ?", (contact_id, kind))
@@ -169,6 +171,7 @@ def add_request(
         record = Command.model_validate({**fields, **arguments})
     except ValidationError as error:
         raise BadInputError("request", *first_error(error)) from error
+    estimate = estimate_request(db, row, kind, link, record.stream_bytes)
     values: Json = {
         "command_id": record.command_id,
         "contact_id": contact_id,
@@ -210,68 +213,6 @@ def update_request_state(
         "UPDATE request SET state = ?, reason = ?, times_sent = ?, changed_utc_s = ? WHERE command_id = ?",
         (state, reason, row["times_sent"] if times_sent is None else times_sent, utc_s, command_id),
     )
-
-
-def apply_tasking_state(db: sqlite3.Connection, state: TaskingState) -> None:
-    """Update the delivery of a request or comment to the vessel."""
-    if state.kind == "command":
-        update_request_state(db, state.record_id, state.state, state.reason, None, state.changed_utc_s)
-        return
-    row = find_record(db, "comment", state.record_id)
-    if row is None or row["state"] in (None, "delivered", "refused") or row["state"] == state.state:
-        return
-    db.execute(
-        "UPDATE comment SET state = ?, reason = ? WHERE comment_id = ?", (state.state, state.reason, state.record_id)
-    )
-
-
-def refuse_comment(db: sqlite3.Connection, comment_id: str, reason: str) -> None:
-    """Mark a comment as refused by c2."""
-    db.execute(
-        "UPDATE comment SET state = 'refused', reason = ? WHERE comment_id = ? AND state = 'waiting'",
-        (reason, comment_id),
-    )
-
-
-def add_comment(db: sqlite3.Connection, contact_id: str, record: Comment, actor: Actor) -> None:
-    """Store a comment of this console."""
-    _insert_comment(db, contact_id, record, "waiting")
-    detail = record.model_dump(include={"comment_id", "verdict", "confidence", "mlo_class", "remark"})
-    displayed = DisplayedImage(record.image_version)
-    add_audit_entry(db, contact_id, actor, "comment", record.commented_utc_s, displayed, detail)
-
-
-def store_received_comment(db: sqlite3.Connection, record: Comment) -> None:
-    """Store a comment from the shore site. A comment without its image is kept until the image arrives.
-
-    Raises:
-        BadInputError: Too many comments wait for their images.
-    """
-    if find_record(db, "comment", record.comment_id) is not None:
-        return
-    contact_id = find_contact_of_image(db, record.vessel_id, record.vehicle_id, record.image_id, record.commented_utc_s)
-    if contact_id is None:
-        check_waiting(db, record)
-    _insert_comment(db, contact_id or "", record, None)
-
-
-def check_waiting(db: sqlite3.Connection, record: Decision | Comment) -> None:
-    """Raise `BadInputError` if too many decisions or comments of a vessel wait for their images."""
-    count = f"SELECT COUNT(*) FROM {record.TYPE} WHERE contact_id = '' AND vessel_id = ?"  # noqa: S608  constants only
-    if db.execute(count, (record.vessel_id,)).fetchone()[0] >= MAX_WAITING:
-        raise BadInputError(record.TYPE, "image_id", record.image_id, f"an image; {MAX_WAITING} others have none yet")
-
-
-def _insert_comment(db: sqlite3.Connection, contact_id: str, record: Comment, state: str | None) -> None:
-    values: Json = {
-        **{name: getattr(record, name) for name in ("comment_id", "vessel_id", "vehicle_id", "image_id")},
-        "contact_id": contact_id,
-        "state": state,
-        "payload": wire.encode(record),
-        "sent": int(state is None),
-    }
-    insert_row(db, "comment", values)
-    db.execute("UPDATE contact SET commented = 1 WHERE id = ?", (contact_id,))
 
 
 FRAME_HEADER_BYTES: Final = 13
@@ -361,3 +302,132 @@ def _first_stream_bytes(db: sqlite3.Connection, row: sqlite3.Row) -> int:
     versions = db.execute("SELECT * FROM version WHERE contact_id = ? ORDER BY version LIMIT 20", (row["id"],))
     lengths = (decode_image(version).bytes_total for version in versions)
     return int(next((length for length in lengths if length), newest_image(row)["bytes_total"]))
+
+
+RECENT_RESULTS: Final = 20
+"""Latest requests of a vehicle from which the next one is estimated."""
+UNKNOWN_COST_LATE_S: Final = 3600.0
+LATE_FACTOR: Final = 2.0
+LATE_MARGIN_S: Final = 300.0
+
+
+def link_record(db: sqlite3.Connection, vehicle_id: str, loss_up: float | None) -> LinkRecord:
+    """Return what the latest requests to a vehicle show of its link; `loss_up`: see `LinkRecord`."""
+    rows = db.execute(
+        "SELECT r.*, (r.arrived_utc_s - r.asked_utc_s) / (r.expected_utc_s - r.asked_utc_s) AS ratio"
+        " FROM request r JOIN contact c ON c.id = r.contact_id WHERE c.vehicle_id = ? ORDER BY r.seq DESC LIMIT ?",
+        (vehicle_id, RECENT_RESULTS),
+    ).fetchall()
+    tries = [row["times_sent"] for row in rows if row["state"] == "confirmed" and row["times_sent"]]
+    ratios = tuple(row["ratio"] for row in rows if row["ratio"] is not None and row["ratio"] > 0)
+    return LinkRecord(loss_up, sum(tries), sum(tries) - len(tries), ratios)
+
+
+def request_columns(contact: sqlite3.Row, kind: str, estimate: RequestEstimate, now_utc_s: float) -> Json:
+    """Return the columns of a new request by which its result is recognised.
+
+    The answer is expected at `expected_utc_s`, with 90 % by `probable_utc_s`, and after `late_utc_s` it is late. The
+    result of a `revisit` depends on the track of the vehicle: it has no expected time.
+    """
+    arrival, late_s = estimate.arrival, None
+    if kind not in ("revisit", "prioritise"):
+        late_s = UNKNOWN_COST_LATE_S if arrival is None else LATE_FACTOR * arrival.most_s + LATE_MARGIN_S
+    return {
+        "base_version": contact["version"],
+        "base_bytes": contact["bytes_received"],
+        "base_total": newest_image(contact)["bytes_total"],
+        "bytes_wanted": estimate.cost.bytes_wanted,
+        "expected_utc_s": arrival and now_utc_s + arrival.median_s,
+        "probable_utc_s": arrival and now_utc_s + arrival.most_s,
+        "late_utc_s": late_s and now_utc_s + late_s,
+    }
+
+
+_Result = tuple[str, int, int, bool]
+"""What has arrived of an answer: contact or image that has it, its version, bytes in addition to those at the time of
+the request, whether the answer is complete."""
+
+
+def update_results(db: sqlite3.Connection, contact_id: str, now_utc_s: float) -> None:
+    """Store the results of the requests about a contact after an image has arrived.
+
+    Args:
+        db: Connection in a transaction.
+        contact_id: The contact of the requests.
+        now_utc_s: Time of arrival.
+    """
+    contact = db.execute("SELECT * FROM contact WHERE id = ?", (contact_id,)).fetchone()
+    open_requests = db.execute(
+        "SELECT * FROM request WHERE contact_id = ? AND arrived_utc_s IS NULL AND state <> 'refused'", (contact_id,)
+    ).fetchall()
+    for request in open_requests:
+        result = _result_of(db, request, contact)
+        known = (request["result_contact"], request["result_version"], request["result_bytes"])
+        if result is None or (not result[3] and result[:3] == known):
+            continue
+        db.execute(
+            "UPDATE request SET result_contact = ?, result_version = ?, result_bytes = ?, arrived_utc_s = ?"
+            " WHERE command_id = ?",
+            (*result[:3], now_utc_s if result[3] else None, request["command_id"]),
+        )
+
+
+def _result_of(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Row) -> _Result | None:
+    kind, base_bytes = request["kind"], request["base_bytes"] or 0
+    if kind == "revisit":
+        return _revisit_result(db, request, contact)
+    if kind == "prioritise":
+        return None
+    if kind == "region":
+        return _region_result(db, request, contact)
+    if kind in NEW_IMAGE_KINDS:
+        row = db.execute(
+            "SELECT id, version, bytes_received, complete FROM contact WHERE parent = ? AND relation = ?"
+            " ORDER BY arrived_utc_s DESC LIMIT 1",
+            (contact["id"], kind),
+        ).fetchone()
+        return None if row is None else tuple(row)
+    if contact["version"] <= (request["base_version"] or 0):
+        return None
+    more_bytes = contact["bytes_received"] - base_bytes
+    is_whole = bool(contact["complete"])
+    if kind == "refine":
+        # Bytes up to the length announced at the time of the request were coming without it.
+        is_whole = is_whole and contact["bytes_received"] > max(base_bytes, request["base_total"] or 0)
+    return (contact["id"], contact["version"], more_bytes, is_whole) if more_bytes > 0 or is_whole else None
+
+
+def _region_result(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Row) -> _Result | None:
+    """Return the first image of the size of the requested region that answers no other request."""
+    command = wire.decode(Command, bytes(request["payload"]), f"request {request['command_id']}")
+    assert command.box is not None
+    top, left, bottom, right = RegionBox(*command.box).pixels(contact["height_px"], contact["width_px"])
+    row = db.execute(
+        "SELECT id, version, bytes_received, complete FROM contact WHERE parent = ? AND relation = 'region'"
+        " AND height_px = ? AND width_px = ? AND arrived_utc_s >= ? AND id NOT IN (SELECT result_contact FROM request"
+        " WHERE result_contact IS NOT NULL AND command_id <> ?) ORDER BY arrived_utc_s LIMIT 1",
+        (contact["id"], bottom - top, right - left, request["asked_utc_s"], request["command_id"]),
+    ).fetchone()
+    return None if row is None else tuple(row)
+
+
+def _revisit_result(db: sqlite3.Connection, request: sqlite3.Row, contact: sqlite3.Row) -> _Result | None:
+    """Return the first later look of the vehicle at the position of the contact."""
+    row = db.execute(
+        "SELECT id, version, bytes_received, 1 FROM contact"
+        " WHERE group_id = ? AND vehicle_id = ? AND id <> ? AND seen_utc_s > ? ORDER BY seen_utc_s LIMIT 1",
+        (contact["group_id"], contact["vehicle_id"], contact["id"], request["asked_utc_s"]),
+    ).fetchone()
+    return None if row is None else tuple(row)
+
+
+def contacts_with_requests(db: sqlite3.Connection, contact_id: str) -> list[str]:
+    """Return the contacts whose requests an image can answer: its contact, and the other looks at one position."""
+    row = db.execute("SELECT id, parent, group_id FROM contact WHERE id = ?", (contact_id,)).fetchone()
+    own = str(row["parent"] or row["id"])
+    others = db.execute(
+        "SELECT DISTINCT c.id FROM contact c JOIN request r ON r.contact_id = c.id"
+        " WHERE c.group_id = ? AND c.id <> ? AND r.kind = 'revisit' AND r.arrived_utc_s IS NULL",
+        (row["group_id"], own),
+    )
+    return [own, *(str(other["id"]) for other in others)]

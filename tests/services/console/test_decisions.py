@@ -9,7 +9,7 @@ from sonarpost import wire
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Decision
 from sonarpost.services.console.config import ConsoleConfig
-from sonarpost.services.console.store import requests
+from sonarpost.services.console.store import decisions
 from sonarpost.services.console.store.database import Database
 
 ID = contact_id()
@@ -77,7 +77,7 @@ def test_decision_is_stored_and_shown_with_all_fields_of_its_record(console, clo
 
 
 def test_decisions_without_images_are_limited_for_each_vessel(console, clock, monkeypatch):
-    monkeypatch.setattr(requests, "MAX_WAITING", 3)
+    monkeypatch.setattr(decisions, "MAX_WAITING", 3)
     records = [
         decision_record(image_id=f"B00{number}", decision_id=f"d-{number}", decided_utc_s=1.7e9) for number in range(4)
     ]
@@ -91,7 +91,7 @@ def test_decisions_without_images_are_limited_for_each_vessel(console, clock, mo
 
 
 def test_comments_without_images_are_limited(console, monkeypatch):
-    monkeypatch.setattr(requests, "MAX_WAITING", 3)
+    monkeypatch.setattr(decisions, "MAX_WAITING", 3)
     for number in range(3):
         console.state.store_comment(comment_record(f"B00{number}", comment_id=f"a-{number}"))
     with pytest.raises(BadInputError, match="3 others have none yet"):
