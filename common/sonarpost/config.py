@@ -278,7 +278,8 @@ class ConfigFile:
                     value, expected = "an unknown key", _known_keys(model, names)
                 by_environment = next((n for n in ("__".join(names[:2]), *names[:1]) if n in overrides), None)
                 if by_environment is not None:
-                    self.errors.append(_override_error(name, by_environment, value, expected))
+                    variable = f"{ENVIRONMENT_PREFIX}{name.upper()}__{by_environment.upper()}"
+                    self.errors.append(ConfigError("environment", variable, value, expected))
                 else:
                     self.errors.append(self.error((name, *names), value, expected))
         return None
@@ -292,10 +293,6 @@ class ConfigFile:
         else:
             expected = "SONARPOST_{platform or a service's name}__{KEY}"
             self.errors.append(ConfigError("environment", name, text, expected))
-
-
-def _override_error(table: str, key: str, value: object, expected: str) -> ConfigError:
-    return ConfigError("environment", f"{ENVIRONMENT_PREFIX}{table.upper()}__{key.upper()}", value, expected)
 
 
 def key_lines(text: str) -> dict[tuple[str, ...], int]:

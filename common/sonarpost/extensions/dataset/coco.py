@@ -64,11 +64,6 @@ class LabelledImage:
         return 3 if contact is not None and contact.atd_class == _STRUCTURE_CLASS else 2
 
 
-def latest_verdicts(contact: ExportContact) -> list[Decision]:
-    """Return the decisions that stand, one of each operator, oldest first, without those that are unsure."""
-    return [d for d in contact.result.standing if d.verdict != "unsure"]
-
-
 def label_state(contact: ExportContact) -> LabelState:
     """Return whether a contact has a label, or why it has none. `disputed` ones have a label that is in doubt."""
     state = contact.review
@@ -94,7 +89,7 @@ def load_labelled_image(contact: ExportContact) -> LabelledImage:
     sha256 = Pixels.from_array(pixels).sha256
     if sha256 != contact.image.pixels_sha256:
         raise StoredFileError(str(contact.image_path), "pixels_sha256", sha256, contact.image.pixels_sha256)
-    operators = len(latest_verdicts(contact))
+    operators = sum(decision.verdict != "unsure" for decision in contact.result.standing)
     return LabelledImage(contact, contact.decision, state == "disputed", operators, to_8_bits(pixels))
 
 

@@ -103,9 +103,10 @@ def write_tiles(
             _compress(raw, packed, level, start)
         data_bytes = packed.tell()
         packed.seek(0)
-        is_big = data_bytes + _directories_bytes(levels, transform, is_big=True) > _CLASSIC_BYTES
+        is_big = data_bytes + len(_pack(levels, transform, 0, is_big=True)) > _CLASSIC_BYTES
+        data_start = len(_pack(levels, transform, 0, is_big=is_big))
         with atomic_file(path) as out:
-            out.write(_directories(levels, transform, is_big=is_big))
+            out.write(_pack(levels, transform, data_start, is_big=is_big))
             shutil.copyfileobj(packed, out, 1 << 20)
 
 
@@ -206,17 +207,8 @@ def _geo_tags(transform: GeoTransform) -> Iterator[_Tag]:
     yield 34735, _SHORT, keys
 
 
-def _directories_bytes(levels: list[_Level], transform: GeoTransform, *, is_big: bool) -> int:
-    return len(_pack(levels, transform, 0, is_big=is_big))
-
-
-def _directories(levels: list[_Level], transform: GeoTransform, *, is_big: bool) -> bytes:
-    """Return the header and all directories; the data follow them."""
-    return _pack(levels, transform, _directories_bytes(levels, transform, is_big=is_big), is_big=is_big)
-
-
 def _pack(levels: list[_Level], transform: GeoTransform, data_start: int, *, is_big: bool) -> bytes:
-    """Return the header and all directories for data that begin at `data_start`."""
+    """Return the header and all directories for data that begin at `data_start`, which does not change their length."""
     out = bytearray(struct.pack("<2sHHHQ", b"II", 43, 8, 0, 16) if is_big else struct.pack("<2sHI", b"II", 42, 8))
     count_code, entry_code, inline = ("Q", "Q", 8) if is_big else ("H", "I", 4)
     for number, level in enumerate(levels):

@@ -229,19 +229,16 @@ class S2cModem(QueueingModem[Sending, RawMessage]):
             # A modem that has restarted has lost its settings.
             self._steps.extend(((b"@ZX1", False), (b"?AL", True)))
             self._send_command(b"AT" + self._steps[0][0], now)
-        if self._ready and self._sending is None and self._command is None and not self._defers(now):
+        # A reception delays the next message, up to a limit.
+        is_late = now - self._receiving_since_s >= self._settings.max_carrier_sense_s
+        is_free = self._receiving_until_s is None or is_late
+        if self._ready and self._sending is None and self._command is None and is_free:
             packet = self._queue.take()
             if packet is not None:
                 is_ping = packet.number in self._pings
                 self._pings.discard(packet.number)
                 self._sending = Sending(packet, is_ping, now)
                 self._send_message(self._sending, now)
-
-    def _defers(self, now: float) -> bool:
-        """Return whether a reception delays the next message."""
-        return (
-            self._receiving_until_s is not None and now - self._receiving_since_s < self._settings.max_carrier_sense_s
-        )
 
     def _configure(self, now: float) -> None:
         """Begin the configuration; packets wait for its end."""

@@ -17,7 +17,6 @@ from sonarpost.extensions.satellite.short_message import (
     ShortMessage,
     ShortMessageError,
     contact_head_bytes,
-    contact_version,
     decision_fragments,
     items_bytes,
     pack_contact,
@@ -61,7 +60,8 @@ class QueuedItem:
     @property
     def is_first_version(self) -> bool:
         """Whether a contact is the first version of its image."""
-        return contact_version(self.item.content) == 1
+        content = self.item.content
+        return int.from_bytes(content[content[0] + 4 : content[0] + 8], "big") == 1
 
     @property
     def min_bytes(self) -> int:

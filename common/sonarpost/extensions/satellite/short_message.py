@@ -221,11 +221,6 @@ def contact_head_bytes(content: bytes) -> int:
     return before_flags + _CONTACT.size + (RECORD_SIZE if flags & _RECORD_BIT else 0)
 
 
-def contact_version(content: bytes) -> int:
-    """Return the version of the image of a contact item."""
-    return int.from_bytes(content[content[0] + 4 : content[0] + 8], "big")
-
-
 def unpack_contact(content: bytes, vessel_id: str, where: str = _WHERE) -> ReceivedImage:
     """Return the record of a contact item: the vessel's version of the image, with the preview only.
 

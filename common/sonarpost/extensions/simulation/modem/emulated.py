@@ -8,7 +8,7 @@ from typing_extensions import override
 from sonarpost.errors import SentenceError
 from sonarpost.extensions.simulation.channel.events import AcousticPacket, ArrivalEnded, PacketKind
 from sonarpost.extensions.simulation.modem.emulator import EmulatedMicroModem
-from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings, airtime_of, good_frames
+from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings, good_frames
 from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 from sonarpost.extensions.simulation.modem.transmitter import TravelTimes
 from sonarpost.modem.udp.datagram import Datagram, DatagramAssembler, DatagramKind
@@ -85,7 +85,7 @@ class UdpRelay(PacketModem):
                 item.source,
                 item.destination,
                 item.rate,
-                _ACK_AIRTIME_S if is_ack else airtime_of(RATES.get(item.rate), _ACK_AIRTIME_S),
+                _ACK_AIRTIME_S if is_ack or item.rate not in RATES else RATES[item.rate].airtime_s,
                 () if is_ack else tuple(frame or b"" for frame in item.frames),
                 ack_requested=item.kind is DatagramKind.DATA_WITH_ACK,
                 acked_frames=tuple(n for n, frame in enumerate(item.frames, 1) if is_ack and frame is not None),

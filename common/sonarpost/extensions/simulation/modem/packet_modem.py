@@ -18,7 +18,6 @@ from sonarpost.extensions.simulation.channel.events import (
     PacketOutcome,
 )
 from sonarpost.extensions.simulation.modem.receiver import HostOutput, PacketReport
-from sonarpost.modem.interface import RateInfo
 
 MAX_QUEUED: Final = 16
 """Packets that wait for the end of the present transmission; the host's next ones are dropped."""
@@ -162,8 +161,3 @@ def good_frames(arrival: ArrivalEnded) -> list[bytes | None]:
         frame.received if frame.outcome in (FrameOutcome.DELIVERED, FrameOutcome.EMPTY) else None
         for frame in arrival.frames
     ]
-
-
-def airtime_of(rate: RateInfo | None, default_s: float) -> float:
-    """Return the air time of a rate, or a default for an unknown one."""
-    return default_s if rate is None else rate.airtime_s
