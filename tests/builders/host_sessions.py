@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.parameters import build_parameters
 from sonarpost.extensions.simulation.channel.simulator import ChannelSimulator, PlacedModem
-from sonarpost.extensions.simulation.modem.emulated import settings_for
+from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 
 
 class Hosts:
@@ -15,7 +15,7 @@ class Hosts:
 
     def __init__(self, driver: str, modems: int = 2, **parameters: float) -> None:
         places = {
-            number: PlacedModem(settings_for(driver, address=number), LocalPosition(150.0 * number))
+            number: PlacedModem(EmulatedModemConfig(number, driver=driver), LocalPosition(150.0 * number))
             for number in range(1, modems + 1)
         }
         self.simulator = ChannelSimulator(build_parameters(parameters, "test"), places)

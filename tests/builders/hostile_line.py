@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.parameters import build_parameters
 from sonarpost.extensions.simulation.channel.simulator import ChannelSimulator, PlacedModem
-from sonarpost.extensions.simulation.modem.emulated import settings_for
+from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 from sonarpost.modem.interface import FrameReceived, Modem, ModemEvent, PacketFailed, PacketSent
 from sonarpost.modem.registry import ModemSettings, modem_driver
 
@@ -108,7 +108,9 @@ class Bench:
         self.rng = random.Random(seed)
         self.now = 0.0
         modems = {
-            number: PlacedModem(_settings(subject.driver, number), LocalPosition(100.0 * number))
+            number: PlacedModem(
+                EmulatedModemConfig(number, utc_at_zero_s=1.5e9, driver=subject.driver), LocalPosition(100.0 * number)
+            )
             for number in (HOSTILE, PEER)
         }
         self.simulator = ChannelSimulator(build_parameters({}, "test"), modems)
@@ -241,16 +243,3 @@ class Bench:
                 # A poll of the far modem and a packet of a killed driver have other numbers.
                 assert event.packet_id in self.open_packets[number], "exactly one result for each packet"
                 self.open_packets[number].discard(event.packet_id)
-
-
-def _settings(driver: str, number: int) -> object:
-    return settings_for(
-        driver,
-        address=number,
-        generation=2,
-        statistics_version=6,
-        utc_at_zero_s=1.5e9,
-        airtimes_s={},
-        data_timeout_s=2,
-        promiscuous=True,
-    )

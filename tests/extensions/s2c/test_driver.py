@@ -27,7 +27,7 @@ from sonarpost.extensions.s2c.messages import (
     parse_travel_time_s,
 )
 from sonarpost.extensions.s2c.rates import CAPABILITIES
-from sonarpost.extensions.simulation.modem.packet_modem import PacketModemSettings
+from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 from sonarpost.modem.interface import (
     FrameReceived,
     ModemEvent,
@@ -436,7 +436,7 @@ def test_destination_and_length_are_checked(address: int) -> None:
 
 
 def test_emulated_modem_limits_its_input_and_knows_both_modes() -> None:
-    modem = EmulatedS2c(PacketModemSettings("s2c", 4))
+    modem = EmulatedS2c(EmulatedModemConfig(4, driver="s2c"))
 
     def say(data: bytes) -> bytes:
         modem.receive(data, 0.0)

@@ -15,7 +15,8 @@ from typing_extensions import override
 from sonarpost.extensions.nanomodem.messages import TRAVEL_STEP_S
 from sonarpost.extensions.nanomodem.rates import MAX_PAYLOAD_BYTES, RATE, airtime_s
 from sonarpost.extensions.simulation.channel.events import AcousticPacket, ArrivalEnded, PacketKind
-from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings, good_frames
+from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, good_frames
+from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 from sonarpost.modem.interface import MAX_ADDRESS
 
 ANSWER_TIMEOUT_S: Final = 4.0
@@ -36,7 +37,7 @@ class EmulatedNanomodem(PacketModem):
 
     INPUT_PAUSE_S: ClassVar[float] = 0.4  # the developer's driver waits 0.5 s; the longest command takes 0.08 s
 
-    def __init__(self, settings: PacketModemSettings) -> None:
+    def __init__(self, settings: EmulatedModemConfig) -> None:
         super().__init__(settings)
         self._address = settings.address
         self._awaits: int | None = None

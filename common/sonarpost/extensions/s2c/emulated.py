@@ -31,8 +31,9 @@ from sonarpost.extensions.simulation.channel.events import (
     PacketKind,
     PacketOutcome,
 )
-from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings, good_frames
+from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, good_frames
 from sonarpost.extensions.simulation.modem.receiver import PacketReport
+from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 
 FIRMWARE: Final = "1.8-sonarpost-emulator"
 
@@ -66,7 +67,7 @@ class EmulatedS2c(PacketModem):
 
     INPUT_PAUSE_S: ClassVar[float] = 2.0  # longer than the longest command takes at 9600 bit/s
 
-    def __init__(self, settings: PacketModemSettings) -> None:
+    def __init__(self, settings: EmulatedModemConfig) -> None:
         super().__init__(settings)
         self._raw = bytearray()
         self._raw_due_s = float("inf")

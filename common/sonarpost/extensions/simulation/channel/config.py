@@ -9,14 +9,10 @@ from pydantic import Field, model_validator
 from sonarpost.config import ServiceConfig
 from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.parameters import ChannelParameters, build_parameters
-from sonarpost.extensions.simulation.modem.emulated import (
-    DEFAULT_MODEM,
-    EmulatorSettings,
-    emulated_drivers,
-    settings_for,
-)
+from sonarpost.extensions.simulation.modem.emulated import emulated_drivers
+from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 from sonarpost.modem.interface import MAX_ADDRESS, MAX_RATE
-from sonarpost.modem.registry import modem_driver
+from sonarpost.modem.registry import DEFAULT_DRIVER, modem_driver
 
 
 class Site(ServiceConfig):
@@ -88,7 +84,7 @@ class EmulatorConfig(ChannelParameters):
     log: Path | None = None
     time_scale: Annotated[float, Field(ge=0.01, le=10_000)] = 1.0
     preset: Literal["still", "sea-trial"] = "still"
-    driver: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")] = DEFAULT_MODEM
+    driver: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,39}$")] = DEFAULT_DRIVER
     airtime_s: Mapping[Annotated[int, Field(ge=0, le=MAX_RATE)], Annotated[float, Field(gt=0, le=600)]] = {}
     generation: Annotated[int, Field(ge=1, le=2)] = 2
     statistics_version: Literal[6, 8] = 6
@@ -119,7 +115,7 @@ class EmulatorConfig(ChannelParameters):
         values = self.model_dump(mode="json", include=given, exclude_none=True)
         return build_parameters(values | {"preset": self.preset}, "channel")
 
-    def modem_config(self, modem: ModemSite, utc_at_zero_s: float, data_timeout_s: int) -> EmulatorSettings:
+    def modem_config(self, modem: ModemSite, utc_at_zero_s: float, data_timeout_s: int) -> EmulatedModemConfig:
         """Return the configuration of one modem.
 
         Args:
@@ -127,9 +123,9 @@ class EmulatorConfig(ChannelParameters):
             utc_at_zero_s: Reading of its clock at simulated time zero, seconds since 1970 UTC.
             data_timeout_s: Its initial `DTO`.
         """
-        return settings_for(
-            self.driver,
-            address=modem.address,
+        return EmulatedModemConfig(
+            modem.address,
+            driver=self.driver,
             generation=self.generation,
             statistics_version=self.statistics_version,
             utc_at_zero_s=utc_at_zero_s,

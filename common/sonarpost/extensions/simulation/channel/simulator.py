@@ -16,8 +16,9 @@ from sonarpost.extensions.simulation.channel.acoustics import LocalPosition
 from sonarpost.extensions.simulation.channel.events import ArrivalStarted, TransmittedPacket
 from sonarpost.extensions.simulation.channel.model import ChannelModel
 from sonarpost.extensions.simulation.channel.parameters import ChannelParameters
-from sonarpost.extensions.simulation.modem.emulated import EmulatedModem, EmulatorSettings, create_modem
+from sonarpost.extensions.simulation.modem.emulated import EmulatedModem, create_modem
 from sonarpost.extensions.simulation.modem.receiver import HostOutput, PacketReport
+from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 
 T = TypeVar("T")
 
@@ -65,7 +66,7 @@ class SerialLine(Generic[T]):
 class PlacedModem:
     """Configuration and position of one modem."""
 
-    config: EmulatorSettings
+    config: EmulatedModemConfig
     position: LocalPosition = field(default_factory=LocalPosition)
 
 

@@ -1,23 +1,21 @@
 """Emulated modems by the name of their driver. The group of entry points is `sonarpost.emulated_modems`."""
 
 from functools import cache
-from typing import ClassVar, Final
+from typing import ClassVar
 
 from typing_extensions import override
 
 from sonarpost.errors import SentenceError
 from sonarpost.extensions.simulation.channel.events import AcousticPacket, ArrivalEnded, PacketKind
 from sonarpost.extensions.simulation.modem.emulator import EmulatedMicroModem
-from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, PacketModemSettings, good_frames
+from sonarpost.extensions.simulation.modem.packet_modem import PacketModem, good_frames
 from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 from sonarpost.extensions.simulation.modem.transmitter import TravelTimes
+from sonarpost.modem.registry import DEFAULT_DRIVER
 from sonarpost.modem.udp.datagram import Datagram, DatagramAssembler, DatagramKind
 from sonarpost.modem.udp.rates import RATES
 from sonarpost.registry import Registry
 
-DEFAULT_MODEM: Final = "micromodem"
-
-EmulatorSettings = EmulatedModemConfig | PacketModemSettings
 EmulatedModem = EmulatedMicroModem | PacketModem
 
 
@@ -34,21 +32,14 @@ def packet_modems() -> Registry[type[PacketModem]]:
 
 def emulated_drivers() -> tuple[str, ...]:
     """Return the names of the drivers that have an emulated modem."""
-    return (DEFAULT_MODEM, *packet_modems().names())
+    return (DEFAULT_DRIVER, *packet_modems().names())
 
 
-def create_modem(settings: EmulatorSettings, travel_times: TravelTimes) -> EmulatedModem:
-    """Return the modem of its settings, switched on at time zero."""
-    if isinstance(settings, EmulatedModemConfig):
-        return EmulatedMicroModem(settings, travel_times=travel_times)
-    return packet_modems().get(settings.driver)(settings)
-
-
-def settings_for(driver: str, *, address: int, **micromodem: object) -> EmulatorSettings:
-    """Return the settings of a modem; those of the Micro-Modem alone are ignored for others."""
-    if driver == DEFAULT_MODEM:
-        return EmulatedModemConfig(address, **micromodem)  # type: ignore[arg-type]
-    return PacketModemSettings(driver, address)
+def create_modem(config: EmulatedModemConfig, travel_times: TravelTimes) -> EmulatedModem:
+    """Return the modem of its configuration, switched on at time zero."""
+    if config.driver == DEFAULT_DRIVER:
+        return EmulatedMicroModem(config, travel_times)
+    return packet_modems().get(config.driver)(config)
 
 
 _ACK_AIRTIME_S = 0.05
@@ -59,7 +50,7 @@ class UdpRelay(PacketModem):
 
     INPUT_PAUSE_S: ClassVar[float] = 5.0  # longer than the longest datagram takes at 9600 bit/s
 
-    def __init__(self, settings: PacketModemSettings) -> None:
+    def __init__(self, settings: EmulatedModemConfig) -> None:
         super().__init__(settings)
         self._assembler = DatagramAssembler()
 

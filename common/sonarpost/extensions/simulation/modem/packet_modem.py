@@ -7,7 +7,6 @@ given up after a pause, so that no bytes of a host make a modem silent.
 
 from abc import ABC, abstractmethod
 from collections import deque
-from dataclasses import dataclass
 from typing import ClassVar, Final
 
 from sonarpost.extensions.simulation.channel.events import (
@@ -18,24 +17,12 @@ from sonarpost.extensions.simulation.channel.events import (
     PacketOutcome,
 )
 from sonarpost.extensions.simulation.modem.receiver import HostOutput, PacketReport
+from sonarpost.extensions.simulation.modem.settings import EmulatedModemConfig
 
 MAX_QUEUED: Final = 16
 """Packets that wait for the end of the present transmission; the host's next ones are dropped."""
 PROCESSING_S: Final = 0.05
 """Time between two transmissions."""
-
-
-@dataclass(frozen=True, slots=True)
-class PacketModemSettings:
-    """Settings of an emulated modem.
-
-    Attributes:
-        driver: Name of its driver.
-        address: Its address.
-    """
-
-    driver: str
-    address: int
 
 
 class PacketModem(ABC):
@@ -47,7 +34,7 @@ class PacketModem(ABC):
 
     INPUT_PAUSE_S: ClassVar[float]  # incomplete input is given up so long after the last byte of the host
 
-    def __init__(self, settings: PacketModemSettings) -> None:
+    def __init__(self, settings: EmulatedModemConfig) -> None:
         self.settings = settings
         self._input = bytearray()
         self._pause_ends_s = float("inf")

@@ -9,6 +9,7 @@ from types import MappingProxyType
 
 from sonarpost.errors import SentenceError
 from sonarpost.modem.micromodem import RATES
+from sonarpost.modem.registry import DEFAULT_DRIVER
 
 FIRMWARE_VERSIONS: Mapping[int, str] = MappingProxyType({1: "0.93.0.09", 2: "2.0.27087"})
 """Version in `CAREV` by generation: four parts for the first, three for the second."""
@@ -45,16 +46,17 @@ _BOUNDS = {
 
 @dataclass(frozen=True, slots=True)
 class EmulatedModemConfig:
-    """Configuration of one emulated modem.
+    """Configuration of one emulated modem; that of another driver than the Micro-Modem's has only an address.
 
     Attributes:
-        address: Initial `SRC`, 0..127.
+        address: Its address; the initial `SRC`.
         generation: 1 or 2: version strings, and whether flexible data is supported.
         statistics_version: Layout of `CACST`: 6, which every known host reads, or 8 of the newest firmware.
         utc_at_zero_s: Reading of the modem's clock at simulated time zero, seconds since 1970 UTC.
         airtimes_s: Air times by rate number, where they differ from the nominal ones.
         data_timeout_s: Initial `DTO`, whole seconds.
         promiscuous: Whether the host receives data addressed to other modems.
+        driver: Name of its driver.
     """
 
     address: int
@@ -64,6 +66,7 @@ class EmulatedModemConfig:
     airtimes_s: Mapping[int, float] = field(default_factory=lambda: MappingProxyType({}))
     data_timeout_s: int = 2
     promiscuous: bool = True
+    driver: str = DEFAULT_DRIVER
 
     def airtime_s(self, rate: int) -> float:
         """Return the air time of a data packet of `rate`."""
