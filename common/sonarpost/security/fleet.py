@@ -167,21 +167,6 @@ class FleetIndex(BaseModel):
         """Return all revoked common names."""
         return sorted({entry.common_name for entry in self.certificates if entry.revoked_utc_s is not None})
 
-    def next_name(self, platform: str) -> str:
-        """Return an unused common name of a platform."""
-        names = (e.common_name for e in self.certificates if e.platform == platform)
-        generation = 1 + max((certificates.platform_of(name)[1] for name in names), default=0)
-        return certificates.common_name(platform, generation)
-
-    def with_revoked(self, name: str, now_utc_s: float, reason: str) -> "FleetIndex":
-        """Return the index with all certificates of a common name revoked."""
-        update = {"revoked_utc_s": now_utc_s, "reason": reason}
-        entries = tuple(
-            entry.model_copy(update=update) if entry.common_name == name and entry.revoked_utc_s is None else entry
-            for entry in self.certificates
-        )
-        return self.model_copy(update={"certificates": entries})
-
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
@@ -273,7 +258,9 @@ class Fleet:
             if (known := index.find(platform)) is not None:
                 got = f"a valid certificate, {known.common_name}, serial {known.serial}"
                 raise PkiError("pki", platform, got, "none; `pki renew` extends it, `pki revoke` ends it")
-            name = index.next_name(platform)
+            used = (entry.common_name for entry in index.certificates if entry.platform == platform)
+            generation = 1 + max((certificates.platform_of(name)[1] for name in used), default=0)
+            name = certificates.common_name(platform, generation)
             _check_prepared(next((known for known in index.prepared if known.platform == platform), None), role)
             return self._issue(index, name, platform, role, hosts, days, out or self.folder / ISSUED / name)
 
@@ -333,7 +320,14 @@ class Fleet:
         with self._locked():
             index = self.index()
             entry = index.current(platform)
-            self._write(index.with_revoked(entry.common_name, self._now_utc_s(), reason))
+            update = {"revoked_utc_s": self._now_utc_s(), "reason": reason}
+            entries = tuple(
+                each.model_copy(update=update)
+                if each.common_name == entry.common_name and each.revoked_utc_s is None
+                else each
+                for each in index.certificates
+            )
+            self._write(index.model_copy(update={"certificates": entries}))
             return entry
 
     def authority_days_left(self) -> float:

@@ -117,7 +117,7 @@ class Migration:
             self._database.write(Batch(images=[*new.values()]))
         for (vessel_id, name), image in expected.items():
             self.counts["compared"] += 1
-            if image.files and self._database.file_digests(vessel_id, name) != _digests(image.row.files_sha256):
+            if image.files and self._database.file_digests(vessel_id, name) != set(image.row.files_sha256.split()):
                 self.problems.append(f"{vessel_id}/{name}: the files in the database differ")
 
     def _stored_images(self, rows: Sequence[ImageRow]) -> Iterator[StoredImage]:
@@ -173,10 +173,6 @@ class Migration:
             if self._database.file_digests(row.vessel_id, decision_name(row.decision_id)) != {row.files_sha256}:
                 self.problems.append(f"{row.vessel_id}/{row.decision_id}: the decision in the database differs")
         self.counts["decisions"] = len(new)
-
-
-def _digests(text: str) -> set[str]:
-    return set(text.split())
 
 
 def _batches(items: Sequence[T]) -> Iterator[Sequence[T]]:

@@ -71,12 +71,9 @@ def _add_common_options(parser: argparse.ArgumentParser) -> None:
 
 def run_comment(parsed: argparse.Namespace) -> int:
     """Send a comment to c2; return 0 after c2 has stored it."""
-    vehicle, image = _vehicle_and_image(parsed)
     fields = {
         "comment_id": parsed.id or f"a-{uuid.uuid4().hex}",
         "vessel_id": parsed.vessel,
-        "vehicle_id": vehicle,
-        "image_id": image,
         "image_version": parsed.version,
         "verdict": parsed.verdict,
         "confidence": parsed.confidence,
@@ -85,19 +82,14 @@ def run_comment(parsed: argparse.Namespace) -> int:
         "author": _author(parsed),
         "commented_utc_s": time.time(),
     }
-    _send(parsed, keys.tasking_comment(parsed.vessel, parsed.site), Comment, fields)
-    _print_accepted("comment", fields["comment_id"], parsed.vessel)
-    return 0
+    return _send(parsed, "comment", keys.tasking_comment(parsed.vessel, parsed.site), Comment, fields)
 
 
 def run_command(parsed: argparse.Namespace) -> int:
     """Send a command to c2; return 0 after c2 has stored it."""
-    vehicle, image = _vehicle_and_image(parsed)
     fields = {
         "command_id": parsed.id or f"c-{uuid.uuid4().hex}",
         "kind": parsed.kind,
-        "vehicle_id": vehicle,
-        "image_id": image,
         "lat_deg": parsed.lat,
         "lon_deg": parsed.lon,
         "issued_by": _author(parsed),
@@ -106,18 +98,7 @@ def run_command(parsed: argparse.Namespace) -> int:
         "stream_bytes": parsed.bytes,
         "place": parsed.place,
     }
-    _send(parsed, keys.tasking_command(parsed.vessel, parsed.site), Command, fields)
-    _print_accepted("command", fields["command_id"], parsed.vessel)
-    return 0
-
-
-def _print_accepted(noun: str, record_id: object, vessel: str) -> None:
-    print(f"{noun} {record_id} for {vessel} accepted; `sonarpost c2 ls --tasking` shows its delivery state")
-
-
-def _vehicle_and_image(parsed: argparse.Namespace) -> tuple[str, str | None]:
-    vehicle, _, image = parsed.image.partition("/")
-    return vehicle, image or None
+    return _send(parsed, "command", keys.tasking_command(parsed.vessel, parsed.site), Command, fields)
 
 
 def _author(parsed: argparse.Namespace) -> str:
@@ -129,10 +110,11 @@ def _author(parsed: argparse.Namespace) -> str:
         raise ConfigError("c2", "--author", "nothing", "a name: the login name is unknown") from error
 
 
-def _send(parsed: argparse.Namespace, key: str, record_type: type[Record], fields: dict[str, object]) -> None:
-    """Validate a record and deliver it to c2."""
+def _send(parsed: argparse.Namespace, noun: str, key: str, record_type: type[Record], fields: dict[str, object]) -> int:
+    """Validate a record and deliver it to c2; return 0."""
+    vehicle, _, image = parsed.image.partition("/")
     try:
-        record = record_type.model_validate(fields)
+        record = record_type.model_validate({**fields, "vehicle_id": vehicle, "image_id": image or None})
     except ValidationError as error:
         raise ConfigError("c2", *first_error(error)) from error
     endpoints, tls = router_of(parsed)
@@ -148,3 +130,6 @@ def _send(parsed: argparse.Namespace, key: str, record_type: type[Record], field
             deliver(session, key, CONSUMER, record, parsed.timeout)
     finally:
         timer.cancel()
+    record_id = fields[f"{noun}_id"]
+    print(f"{noun} {record_id} for {parsed.vessel} accepted; `sonarpost c2 ls --tasking` shows its delivery state")
+    return 0
