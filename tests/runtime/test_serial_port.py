@@ -296,21 +296,6 @@ def test_second_program_is_refused_and_the_first_keeps_its_bytes(pty_port, first
         os.read(pty_port.master, 1)
 
 
-def test_port_in_use_is_retried_and_opened_when_it_is_free(pty_port, first, caplog):
-    port = SerialPort(str(pty_port.path))
-    events = PortEvents(port)
-    with closing(port):
-        eventually(lambda: port.error is not None)
-        assert port.error.startswith("in use by ")
-        assert port.error.endswith(ME)
-        assert not port.is_open
-        close_port(first)
-        assert events.next() == PortOpened()
-        assert port.error is None
-    [line] = [record for record in caplog.records if "cannot be opened" in record.message]
-    assert line.fields["reason"].endswith(ME)
-
-
 def test_each_reason_of_a_port_that_is_not_open_is_logged_once(pty_port, first, caplog):
     link = pty_port.path.with_name("adapter")
     port = SerialPort(str(link))
