@@ -135,7 +135,6 @@ class QueueSender:
         self._first_acknowledged_s = 0.0
         self._done_up_to = 0
         self._failures = 0
-        self._max_batch = 0
         self._batch_refused = False
         self._stop = threading.Event()
         self._wake = threading.Event()
@@ -358,7 +357,7 @@ class QueueSender:
         try:
             if len(chunks) == 1:
                 reply = AckReply.unpack(payload, where)
-                self._max_batch = reply.max_batch
+                self._scheduler.max_batch = 0 if self._batch_refused else reply.max_batch
                 item = chunks[0].transfer.item
                 if reply.highest and (self._scheduler.probing or reply.highest >= item.seq):
                     self._check_age(item, reply)
@@ -392,7 +391,6 @@ class QueueSender:
         self._failures = 0
         self.responding = True
         self._scheduler.probing = False
-        self._scheduler.max_batch = 0 if self._batch_refused else self._max_batch
         if transfer.item.seq not in self._scheduler.active:
             return
         if reply.status == "stored":
