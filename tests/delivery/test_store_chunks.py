@@ -25,7 +25,7 @@ def chunks(data, *cuts, seq=1, origin=ORIGIN):
 
 def add(store, chunk, key=KEY):
     with store.transaction() as tx:
-        return tx.add_chunk(key, chunk)
+        return tx.partial_records.add(key, chunk)
 
 
 def partials(store):
@@ -168,5 +168,5 @@ def test_reclaim_deletes_the_records_of_the_largest_writer(store):
     add(store, chunks(bytes(100), 60)[0], OTHER_KEY)
     for expected in (60, 40, 0):
         with store.transaction() as tx:
-            assert tx.reclaim_partial_records() == expected
+            assert tx.partial_records.reclaim() == expected
     assert partials(store) == 0

@@ -31,14 +31,6 @@ class DiskReserve:
         self._reached = False
         self._rejection = ""
 
-    def free_bytes(self) -> int:
-        """Return the usable space in bytes.
-
-        Raises:
-            DeliveryError: The store cannot be read.
-        """
-        return shutil.disk_usage(self._folder).free + self._store.reusable_bytes()
-
     def require(self) -> None:
         """Check the free space.
 
@@ -65,7 +57,7 @@ class DiskReserve:
     def _check(self) -> str:
         free_bytes = shutil.disk_usage(self._folder).free
         if free_bytes < self._reserve_bytes:
-            free_bytes = self.free_bytes()
+            free_bytes += self._store.reusable_bytes()
         self._reached = free_bytes < self._reserve_bytes
         if not self._reached:
             return ""

@@ -303,10 +303,10 @@ class Inbox(Generic[T]):
         try:
             self._require_capacity(key)
         except RetryLaterError as error:
-            if tx.reclaim_partial_records():
+            if tx.partial_records.reclaim():
                 log.warning("Incomplete records deleted, to accept complete ones", extra=kv(reason=str(error)))
             return AckReply("later", reason=str(error)[:MAX_REASON])
-        record = tx.add_chunk(key, chunk)
+        record = tx.partial_records.add(key, chunk)
         if isinstance(record, int):
             return AckReply("more", next_offset=record)
         if hashlib.sha256(record).digest() != chunk.sha256:

@@ -24,8 +24,8 @@ import msgpack
 from sonarpost.delivery import schema
 from sonarpost.delivery.records import InboxItem, OutboxItem, Place, QuarantinedRecord
 from sonarpost.delivery.transaction import MAX_QUARANTINED_BYTES, Transaction, runs
+from sonarpost.delivery.watermark import LOST, LostRecords, Watermark, lost_records
 from sonarpost.delivery.watermark import SUFFIX as SIDE_CAR_SUFFIX
-from sonarpost.delivery.watermark import LostRecords, Watermark, clear_lost_records, lost_records
 from sonarpost.errors import BadInputError, DeliveryError
 from sonarpost.files import make_private
 
@@ -396,7 +396,7 @@ class Store:
     def clear_lost(self) -> LostRecords | None:
         """Delete the report of lost commits; return it."""
         with self.transaction():
-            clear_lost_records(self._db)
+            self._db.execute("DELETE FROM meta WHERE name = ?", (LOST,))
         lost, self.lost = self.lost, None
         return lost
 

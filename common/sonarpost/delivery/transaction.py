@@ -118,6 +118,7 @@ class Transaction:
         wrote_inbox: Whether a record was added to the inbox and has to be handled.
         numbered_inbox: Whether a record was accepted, and handled or not.
         first_places: Place of the first new record of each queue.
+        partial_records: Chunks of records that are not complete yet.
         superseded: Number of queued records that newer editions replaced.
         states_discarded: Number of states that could not be read.
     """
@@ -133,7 +134,7 @@ class Transaction:
         self._new_topics: set[tuple[str, str]] = set()
         self.first_places: dict[str, Place] = {}
         self._new_inbox: list[tuple[object, ...]] = []
-        self._partial_records = PartialRecords(connection)
+        self.partial_records = PartialRecords(connection)
         self._new_states: list[tuple[str, bytes]] = []
         self._handled: list[int] = []
         self._handled_at_once = 0
@@ -377,14 +378,6 @@ class Transaction:
         if window is None:
             window = self._windows[key, origin] = DuplicateWindow(self._db, key, origin)
         return window
-
-    def add_chunk(self, key: str, chunk: ReceivedChunk) -> bytes | int:
-        """Add a chunk of a record; return the complete record, or the next offset to send."""
-        return self._partial_records.add(key, chunk)
-
-    def reclaim_partial_records(self) -> int:
-        """Delete the incomplete records of the writer that holds the most; return the number of bytes."""
-        return self._partial_records.reclaim()
 
     # State
 

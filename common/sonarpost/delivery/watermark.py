@@ -156,15 +156,6 @@ def lost_records(db: sqlite3.Connection) -> LostRecords | None:
     return None if row is None else LostRecords.unpack(bytes(row[0]))
 
 
-def clear_lost_records(db: sqlite3.Connection) -> None:
-    """Delete the report of lost commits.
-
-    Raises:
-        sqlite3.Error: The store cannot be written.
-    """
-    db.execute("DELETE FROM meta WHERE name = ?", (LOST,))
-
-
 def read(store_path: Path) -> Marks | None:
     """Read the side-car of a store; None if there is none.
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
@@ -64,7 +63,6 @@ class RecordHandler:
         self._store = service.store
         self._health = health
         self._stopping = service.stopping
-        self._lock = threading.Lock()
         self._record_type = lru_cache(TYPES_KEPT)(self._find_record_type)
         self._decoded: dict[tuple[str, bytes], Record] = {}  # accepted records that are not handled yet
         self._refusal_logs: dict[str, IntervalLog] = {}
@@ -105,16 +103,6 @@ class RecordHandler:
         if writer not in self._refusal_logs:
             self._refusal_logs[writer] = self._health.interval_log(log, logging.ERROR, "Record refused")
         return self._refusal_logs[writer]
-
-    @contextmanager
-    def handling(self, *, wait: bool = True) -> Iterator[bool]:
-        """Hold the lock under which records are handled; yield False if it is not free and not `wait`."""
-        is_held = self._lock.acquire(blocking=wait)
-        try:
-            yield is_held
-        finally:
-            if is_held:
-                self._lock.release()
 
     def run(self) -> None:
         """Handle records until the service stops."""

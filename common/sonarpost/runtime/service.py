@@ -75,6 +75,7 @@ class Service(ABC, Generic[C]):
         self._disk_reserve = DiskReserve(self.store, HANDLING_RESERVE_BYTES, "senders keep their records")
         self._health = ServiceHealth(self, self._disk_reserve, tls)
         self._handler = RecordHandler(self, self._health)
+        self._handling_lock = threading.Lock()
         self._session: zenoh.Session | None = None
         self._inbox: Inbox[Record] | None = None
         self._outbox: Outbox | None = None
@@ -306,8 +307,12 @@ class Service(ABC, Generic[C]):
 
         A subclass that extends it encloses the handling and the commit of each batch.
         """
-        with self._handler.handling(wait=wait) as is_held:
+        is_held = self._handling_lock.acquire(blocking=wait)
+        try:
             yield is_held
+        finally:
+            if is_held:
+                self._handling_lock.release()
 
     def commit(self, effects: UnitOfWork) -> None:
         """Write a unit of work in a transaction of its own."""
