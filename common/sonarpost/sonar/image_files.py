@@ -113,27 +113,25 @@ def _unused_reason(path: Path) -> str:
     return "" if path.is_file() else "not a regular file"
 
 
-def write_tiff(path: Path, image: GreyImage, description: str | None = None) -> None:
+def write_tiff(path: Path, image: GreyImage) -> None:
     """Write a grey image as TIFF, atomically, with lossless compression (deflate), which common readers support.
 
-    The image has shape (rows, columns), uint8 or uint16. The description, ASCII, is that of the TIFF tag.
+    The image has shape (rows, columns), uint8 or uint16.
 
     Raises:
-        SurveyFileError: Another shape or depth, or a description that is not ASCII.
+        SurveyFileError: Another shape or depth.
         OSError: The file cannot be written.
     """
-    write_atomically(path, tiff_bytes(path, image, description))
+    write_atomically(path, tiff_bytes(path, image))
 
 
-def tiff_bytes(path: Path, image: GreyImage, description: str | None = None) -> bytes:
+def tiff_bytes(path: Path, image: GreyImage) -> bytes:
     """Return the bytes that `write_tiff` writes; `path` is for error messages only.
 
     Raises:
-        SurveyFileError: Another shape or depth, or a description that is not ASCII.
+        SurveyFileError: Another shape or depth.
     """
     _check_writable(path, image)
-    if description is not None and not description.isascii():
-        raise SurveyFileError(str(path), "description", description, "ASCII text")
     buffer = io.BytesIO()
     tifffile.imwrite(
         buffer,
@@ -144,7 +142,6 @@ def tiff_bytes(path: Path, image: GreyImage, description: str | None = None) -> 
         software=False,  # a version number would make the bytes depend on the installation
         datetime=None,
         metadata=None,
-        description=description,
     )
     return buffer.getvalue()
 

@@ -59,6 +59,16 @@ def is_plausible(name: str, value: float) -> bool:
     return math.isfinite(value) and low <= value <= high
 
 
+def plausible(name: str, value: float) -> float | None:
+    """Return a recorded value; None if it is not finite or outside `NAVIGATION_LIMITS`."""
+    return value if is_plausible(name, value) else None
+
+
+def plausible_angle(angle_deg: float) -> float | None:
+    """Return a recorded heading or course, from 0 to below 360 degrees; None if it is implausible."""
+    return angle_deg % 360 if is_plausible("heading_deg", angle_deg) else None
+
+
 def position_in_degrees(lat_deg: float, lon_deg: float) -> Position | None:
     """Return a position as stored in a file, with a longitude of -180 to 360; None if it is 0/0 or out of range."""
     valid = abs(lat_deg) <= 90 and -180 <= lon_deg <= 360 and (lat_deg, lon_deg) != (0.0, 0.0)  # excludes NaN

@@ -32,7 +32,7 @@ import numpy as np
 from typing_extensions import override
 
 from sonarpost.sonar.geometry import Position
-from sonarpost.sonar.navigation import KNOT_MPS, is_plausible, position_in_degrees
+from sonarpost.sonar.navigation import KNOT_MPS, plausible, plausible_angle, position_in_degrees
 from sonarpost.sonar.projection import Projection, grid_coordinates
 from sonarpost.sonar.readers.file_source import FileSource
 from sonarpost.sonar.readers.joining import PingPart, joined
@@ -148,23 +148,16 @@ class JsfSource(FileSource):
             if subsystem not in _SIDE_SCAN or side is None:
                 notes.add(f"skipped sonar message: subsystem {subsystem}, channel {raw[8]}, not side-scan")
                 continue
-            part = None
+            protocol, body = raw[2], raw[MESSAGE_BYTES:]
             with notes.leaving_out(place):
-                part = self._part(place, raw, side, notes)
-            if part is not None:
-                yield part
+                channel = self._channel(place, protocol, subsystem, side, body, notes)
+                if channel is not None:
+                    (number,) = struct.unpack_from("<I", body, 8)
+                    time_s = self._time(place, protocol, body)
+                    yield PingPart(number, time_s, (protocol, body[:SONAR_BYTES]), (channel,))
         if kinds and not has_side_scan:
             found = ", ".join(f"type {kind} ({count} times)" for kind, count in kinds.most_common(6))
             raise self._file.error("messages", found, f"type {SONAR_MESSAGE} of a side-scan subsystem (20, 21, 22)")
-
-    def _part(self, place: str, raw: bytes, side: Side, notes: Notes) -> PingPart[_Head] | None:
-        """Return the content of a side-scan message; None if it is not an image of the seabed."""
-        protocol, subsystem, body = raw[2], raw[7], raw[MESSAGE_BYTES:]
-        channel = self._channel(place, protocol, subsystem, side, body, notes)
-        if channel is None:
-            return None
-        (number,) = struct.unpack_from("<I", body, 8)
-        return PingPart(number, self._time(place, protocol, body), (protocol, body[:SONAR_BYTES]), (channel,))
 
     def _channel(
         self, place: str, protocol: int, subsystem: int, side: Side, body: bytes, notes: Notes
@@ -207,7 +200,7 @@ class JsfSource(FileSource):
         position, grid_m = self._position(body) if _is_valid(body, _POSITION) else (None, None)
 
         def known(bit: int, name: str, value: float) -> float | None:
-            return value if _is_valid(body, bit) and is_plausible(name, value) else None
+            return plausible(name, value) if _is_valid(body, bit) else None
 
         depth_mm, altitude_mm = struct.unpack_from("<i4xi", body, 136)
         heading, pitch, roll = struct.unpack_from("<Hhh", body, 172)
@@ -215,24 +208,20 @@ class JsfSource(FileSource):
         if protocol >= _PROTOCOL_FRACTIONS:
             course_deg += min(body[19], 99) / 100
             speed += min(body[20] & 0xF, 9) / 10
-        heading_deg, course_deg = (
-            None if known(bit, "heading_deg", value) is None else value % 360
-            for bit, value in ((_HEADING, heading / 100), (_COURSE, course_deg))
-        )
         return Ping(
             number=part.number,
             time_utc_s=part.time_utc_s,
             channels=part.channels,
             lat_deg=position.lat_deg if position else None,
             lon_deg=position.lon_deg if position else None,
-            heading_deg=heading_deg,
+            heading_deg=plausible_angle(heading / 100) if _is_valid(body, _HEADING) else None,
             altitude_m=(known(_ALTITUDE, "altitude_m", altitude_mm / 1000) or None),
             depth_m=known(_DEPTH, "depth_m", depth_mm / 1000),
             speed_mps=known(_SPEED, "speed_mps", speed / 10 * KNOT_MPS),
             pitch_deg=known(_ATTITUDE, "pitch_deg", pitch * 180 / 32768),
             roll_deg=known(_ATTITUDE, "roll_deg", roll * 180 / 32768),
             grid_m=grid_m,
-            course_deg=course_deg,
+            course_deg=plausible_angle(course_deg) if _is_valid(body, _COURSE) else None,
             layback_m=self._layback_m(body),
         )
 

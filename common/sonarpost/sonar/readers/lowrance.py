@@ -32,7 +32,7 @@ import numpy.typing as npt
 from typing_extensions import override
 
 from sonarpost.sonar.geometry import Position
-from sonarpost.sonar.navigation import KNOT_MPS, is_plausible, position_in_degrees
+from sonarpost.sonar.navigation import KNOT_MPS, plausible, position_in_degrees
 from sonarpost.sonar.readers.file_source import FileSource
 from sonarpost.sonar.readers.open_file import CheckedFile, SequentialReader
 from sonarpost.sonar.readers.records import Notes, RecordFormat, records
@@ -197,7 +197,6 @@ class LowranceSource(FileSource):
         (speed_kn,) = struct.unpack_from("<f", raw, layout.speed)
         (course_rad,) = struct.unpack_from("<f", raw, layout.course)
         (heading_rad,) = struct.unpack_from("<f", raw, layout.heading)
-        speed_mps = speed_kn * KNOT_MPS
         return Ping(
             number=struct.unpack_from("<I", raw, layout.index)[0],
             time_utc_s=self._started_s + time_ms / 1000,
@@ -208,7 +207,7 @@ class LowranceSource(FileSource):
             lat_deg=position.lat_deg if position else None,
             lon_deg=position.lon_deg if position else None,
             heading_deg=_angle_deg(heading_rad),
-            speed_mps=speed_mps if is_plausible("speed_mps", speed_mps) else None,
+            speed_mps=plausible("speed_mps", speed_kn * KNOT_MPS),
             course_deg=_angle_deg(course_rad),
         )
 

@@ -35,7 +35,7 @@ from typing import Final
 import numpy as np
 from typing_extensions import override
 
-from sonarpost.sonar.navigation import is_plausible, position_in_degrees
+from sonarpost.sonar.navigation import plausible, plausible_angle, position_in_degrees
 from sonarpost.sonar.readers.file_source import FileSource
 from sonarpost.sonar.readers.joining import PingPart, joined
 from sonarpost.sonar.readers.records import Notes, RecordFormat, records
@@ -126,33 +126,25 @@ class SdfSource(FileSource):
             if version not in SIDE_SCAN_PAGES:
                 notes.add(f"skipped page of version {version}: not side-scan of a UUV-3500 sonar (3501, 3502)")
                 continue
-            part = None
             with notes.leaving_out(place):
-                part = self._part(place, raw, SIDE_SCAN_PAGES.index(version), notes)
-            if part is not None:
-                yield part
+                channels = self._channels(place, raw, SIDE_SCAN_PAGES.index(version), notes)
+                if channels:
+                    (number,) = struct.unpack_from("<I", raw, 16)
+                    yield PingPart(number, self._time(place, raw), raw[:_DATA], channels)
         if versions and versions.keys().isdisjoint(SIDE_SCAN_PAGES):
             others = ", ".join(f"{version} ({count} times)" for version, count in versions.most_common(6))
             expected = "3501 or 3502, the side-scan pages of UUV-3500 sonars; pages of other versions are not read"
             raise self._file.error("page version", others, expected)
 
-    def _part(self, place: str, raw: bytes, index: int, notes: Notes) -> PingPart[bytes] | None:
-        """Return the content of a side-scan page; None if it has no channels.
+    def _channels(self, place: str, raw: bytes, index: int, notes: Notes) -> tuple[ChannelPing, ...]:
+        """Return the sides of a page; none if its header contradicts them.
 
         Raises:
-            SurveyFileError: The page contradicts itself.
+            SurveyFileError: The page has another header, or is shorter than its samples.
         """
         (header_bytes,) = struct.unpack_from("<I", raw, _HEADER_SIZE)
         if header_bytes != HEADER_BYTES:
             raise self._file.error(f"{place}, size of the header", header_bytes, str(HEADER_BYTES))
-        channels = self._channels(place, raw, index, notes)
-        if not channels:
-            return None
-        (number,) = struct.unpack_from("<I", raw, 16)
-        return PingPart(number, self._time(place, raw), raw[:_DATA], channels)
-
-    def _channels(self, place: str, raw: bytes, index: int, notes: Notes) -> tuple[ChannelPing, ...]:
-        """Return the sides of a page; none if its header contradicts them."""
         want, range_m = struct.unpack_from("<I8xI", raw, 20)
         (frequency_khz,) = struct.unpack_from("<I", raw, 408)
         low_khz, high_khz = _FREQUENCIES_KHZ
@@ -202,7 +194,7 @@ def _ping(part: PingPart[bytes]) -> Ping:
     attitude_known = pitch_deg != 0 or roll_deg != 0
 
     def known(name: str, value: float) -> float | None:
-        return value if value != 0 and is_plausible(name, value) else None
+        return plausible(name, value) if value != 0 else None
 
     return Ping(
         number=part.number,
@@ -210,10 +202,10 @@ def _ping(part: PingPart[bytes]) -> Ping:
         channels=part.channels,
         lat_deg=position.lat_deg if position else None,
         lon_deg=position.lon_deg if position else None,
-        heading_deg=None if known("heading_deg", heading_deg) is None else heading_deg % 360,
+        heading_deg=plausible_angle(heading_deg) if heading_deg != 0 else None,
         altitude_m=known("altitude_m", altitude_m),
         depth_m=known("depth_m", depth_m),
         speed_mps=known("speed_mps", struct.unpack_from("<I", head, 36)[0] / 100),
-        pitch_deg=pitch_deg if attitude_known and is_plausible("pitch_deg", pitch_deg) else None,
-        roll_deg=roll_deg if attitude_known and is_plausible("roll_deg", roll_deg) else None,
+        pitch_deg=plausible("pitch_deg", pitch_deg) if attitude_known else None,
+        roll_deg=plausible("roll_deg", roll_deg) if attitude_known else None,
     )

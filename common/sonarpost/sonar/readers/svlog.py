@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import override
 
-from sonarpost.sonar.navigation import is_plausible
+from sonarpost.sonar.navigation import plausible_angle
 from sonarpost.sonar.readers.file_source import FileSource
 from sonarpost.sonar.readers.records import Notes, RecordFormat, records
 from sonarpost.sonar.readers.svlog_messages import NavigationMessages, json_object, number
@@ -154,8 +154,7 @@ class SvlogSource(FileSource):
                         clocks_s.clear()
                     clocks_s[channel.side, channel.index] = clock_s
                     # Exactly 0 is the value of a sonar without a vehicle's heading.
-                    is_heading = vehicle_heading_deg != 0 and is_plausible("heading_deg", vehicle_heading_deg)
-                    heading_deg = vehicle_heading_deg % 360 if is_heading else None
+                    heading_deg = plausible_angle(vehicle_heading_deg) if vehicle_heading_deg != 0 else None
                     yield Profile(place, segment, session, number_of_ping, clock_s, channel, received, heading_deg)
 
     def _session(self, payload: bytes, place: str, notes: Notes) -> SessionClock | None:

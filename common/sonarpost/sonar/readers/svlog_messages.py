@@ -12,7 +12,7 @@ import re
 from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
-from sonarpost.sonar.navigation import KNOT_MPS, is_plausible, position_in_degrees
+from sonarpost.sonar.navigation import KNOT_MPS, plausible, plausible_angle, position_in_degrees
 from sonarpost.sonar.readers.records import Notes
 
 _UNKNOWN_HEADING: Final = 65_535
@@ -73,7 +73,7 @@ class NavigationMessages:
                 names = ("yaw", "pitch", "roll")
                 yaw_deg, pitch_deg, roll_deg = (math.degrees(fields.get(name, math.nan)) for name in names)
                 self._set_heading(yaw_deg + 360 * (yaw_deg < 0))
-                self._set(pitch_deg=_plausible("pitch_deg", pitch_deg), roll_deg=_plausible("roll_deg", roll_deg))
+                self._set(pitch_deg=plausible("pitch_deg", pitch_deg), roll_deg=plausible("roll_deg", roll_deg))
             case "SYSTEM_TIME":
                 self._set_utc(fields.get("time_unix_usec", 0.0) / 1e6)
 
@@ -96,8 +96,8 @@ class NavigationMessages:
 
     def _set_heading(self, heading_deg: float) -> None:
         """Take a heading; an implausible one leaves that of an earlier message."""
-        if is_plausible("heading_deg", heading_deg):
-            self._set(heading_deg=heading_deg % 360)
+        if (plausible_deg := plausible_angle(heading_deg)) is not None:
+            self._set(heading_deg=plausible_deg)
 
     def _set_position(self, lat_deg: float, lon_deg: float) -> None:
         position = position_in_degrees(lat_deg, lon_deg)
@@ -105,8 +105,8 @@ class NavigationMessages:
         self._set(lat_deg=lat_lon_deg[0], lon_deg=lat_lon_deg[1])
 
     def _set_motion(self, speed_mps: float, course_deg: float) -> None:
-        has_course = speed_mps >= _MIN_COURSE_MPS and is_plausible("heading_deg", course_deg)
-        self._set(speed_mps=_plausible("speed_mps", speed_mps), course_deg=course_deg % 360 if has_course else None)
+        course = plausible_angle(course_deg) if speed_mps >= _MIN_COURSE_MPS else None
+        self._set(speed_mps=plausible("speed_mps", speed_mps), course_deg=course)
 
     def _set_utc(self, utc_s: float) -> None:
         self._utc_s = utc_s if utc_s >= _FIRST_UTC_S else self._utc_s
@@ -162,10 +162,6 @@ def number(value: object) -> float | None:
     except OverflowError:
         return None
     return found if math.isfinite(found) else None
-
-
-def _plausible(name: str, value: float) -> float | None:
-    return value if is_plausible(name, value) else None
 
 
 def _nmea_position(lat: str, north: str, lon: str, east: str) -> tuple[float, float]:

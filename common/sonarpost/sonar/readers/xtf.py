@@ -100,12 +100,11 @@ class XtfSource(FileSource):
             elif not any(raw[4:6]):
                 notes.add("skipped packet without channels: not a ping")
             else:
-                channels: tuple[ChannelPing, ...] = ()
                 with notes.leaving_out(place):
                     head, time_utc_s = parser.header(raw, place)
                     channels = tuple(parser.channels(raw, head, place))
-                if channels:
-                    yield PingPart(int(head.PingNumber), time_utc_s, (head, attitude), channels)
+                    if channels:
+                        yield PingPart(int(head.PingNumber), time_utc_s, (head, attitude), channels)
 
 
 class _PortOrderCheck:

@@ -14,7 +14,15 @@ from typing import Any, Final, Literal
 from pyxtf import XTFPingHeader
 
 from sonarpost.sonar.geometry import Position, offset_between_m
-from sonarpost.sonar.navigation import KNOT_MPS, PingNotes, is_plausible, out_of_range, position_in_degrees
+from sonarpost.sonar.navigation import (
+    KNOT_MPS,
+    PingNotes,
+    is_plausible,
+    out_of_range,
+    plausible,
+    plausible_angle,
+    position_in_degrees,
+)
 from sonarpost.sonar.options import SurveyOptions
 from sonarpost.sonar.projection import Projection, grid_coordinates
 from sonarpost.sonar.readers.joining import PingPart
@@ -121,14 +129,14 @@ class Navigation:
                 notes.add(out_of_range(name), row)
         known = self._recorded if x or y or any(stored.values()) else set()  # the recorder had no navigation yet
         values: dict[str, Any] = {
-            name: value if name in known and is_plausible(name, value) else None for name, value in stored.items()
+            name: plausible(name, value) if name in known else None for name, value in stored.items()
         }
         values["altitude_m"] = values["altitude_m"] or None
         if values["heading_deg"] == 360.0:
             values["heading_deg"] = 0.0
         if attitude is not None and 0 <= part.time_utc_s - attitude[0] <= _ATTITUDE_VALID_S:
             values.update((name, attitude[1][name]) for name in self._from_attitude)
-        gyro_deg, layback_m = float(head.ShipGyro), _layback_m(head)
+        layback_m = _layback_m(head)
         unapplied = self._layback_use == "note" and layback_m > _LAYBACK_M[0]
         position = place if isinstance(place, Position) else None
         if grid_m is not None and self._projection is not None:
@@ -140,7 +148,7 @@ class Navigation:
             lat_deg=None if position is None else position.lat_deg,
             lon_deg=None if position is None else position.lon_deg,
             grid_m=grid_m,
-            gyro_deg=gyro_deg % 360 if "gyro" in known and is_plausible("heading_deg", gyro_deg) else None,
+            gyro_deg=plausible_angle(float(head.ShipGyro)) if "gyro" in known else None,
             layback_m=layback_m or None if self._layback_use == "apply" else None,
             position_note=self._note(layback_m) if unapplied and not self._is_calculated(head, layback_m) else None,
             **values,
