@@ -199,6 +199,20 @@ def test_continuation_requires_same_sampling_time_and_place(make_survey, monkeyp
     assert add(detector, replace(after, pings=tuple(map(change, after.pings)))).joined is continues
 
 
+def test_another_frequency_is_no_continuation(make_survey, monkeypatch):
+    monkeypatch.setattr(stream, "search", lambda *_: SearchResult((), {}))
+
+    def at_frequency(survey, hz):
+        return replace(
+            survey, pings=tuple(with_channels(p, lambda c: replace(c, frequency_hz=hz)) for p in survey.pings)
+        )
+
+    before, after = split(make_survey(), 100)
+    detector = detector_of()
+    add(detector, at_frequency(before, 400e3))
+    assert not add(detector, at_frequency(after, 900e3)).joined
+
+
 def test_coordinates_in_metres_show_a_jump(make_survey, monkeypatch):
     monkeypatch.setattr(stream, "search", lambda *_: SearchResult((), {}))
     survey = make_survey()

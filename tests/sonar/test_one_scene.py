@@ -12,14 +12,12 @@ from builders.surveys import MAKERS, make_lowrance, make_xtf
 from sonarpost.cli.main import main
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.sonar.geometry import Position, offset_between_m
-from sonarpost.sonar.survey import ChannelPing, Side
+from sonarpost.sonar.survey import ChannelPing
 
 pytestmark = pytest.mark.system
 
 RANGE_M = 25.0
 """That of the makers of formats which store no range of their own."""
-PING_BYTES, CHANNEL_BYTES = 256, 64
-PROFILE, PROFILE_CHANNEL = 2198, 34
 
 
 @pytest.fixture(scope="module")
@@ -33,43 +31,6 @@ def scene():
     others = {"depth_m": 12.0, "pitch_deg": 1.5, "roll_deg": -2.0}  # some makers need all fields
     pings = tuple(replace(p, channels=tuple(map(without_zeros, p.channels)), **others) for p in made)
     return replace(made, pings=pings)
-
-
-def with_low_frequency(survey):
-    """Return the survey with channels of another frequency and twice the range behind those of each ping."""
-
-    def low(channel):
-        half = channel.samples[: len(channel.samples) // 2 * 2].reshape(-1, 2).mean(axis=1).astype(np.uint8)
-        return ChannelPing(channel.side, np.concatenate([half, np.ones_like(half)]), 2 * RANGE_M, 120e3)
-
-    return replace(survey, pings=tuple(replace(p, channels=(*p.channels, *map(low, p.channels))) for p in survey.pings))
-
-
-def in_packets(path, channels_each, first):
-    """Write each packet of an XTF file as packets of `channels_each` channels; `first` numbers them by subchannel."""
-    data = path.read_bytes()
-    out, offset = bytearray(data[:1024]), 1024
-    while offset < len(data):
-        (size,) = struct.unpack_from("<I", data, offset + 10)
-        head, place = data[offset : offset + PING_BYTES], offset + PING_BYTES
-        (count,) = struct.unpack_from("<H", head, 4)
-        bodies = []
-        for _ in range(count):
-            (samples,) = struct.unpack_from("<I", data, place + 42)
-            end = place + CHANNEL_BYTES + samples
-            bodies.append(data[place:end])
-            place = end
-        for number in range(0, count, channels_each):
-            body = b"".join(bodies[number : number + channels_each])
-            packet = bytearray(head) + body
-            packet += bytes(-len(packet) % 64)
-            packet[3] = number // channels_each if first else 0
-            struct.pack_into("<H", packet, 4, len(bodies[number : number + channels_each]))
-            struct.pack_into("<I", packet, 10, len(packet))
-            out += packet
-        offset += size
-    path.write_bytes(out)
-    return path
 
 
 def version_13(survey, folder):
@@ -89,32 +50,14 @@ def version_13(survey, folder):
     return path
 
 
-def one_unit(survey, folder):
-    """Write an SVLOG file of one transducer, on the side of the object."""
-    path = MAKERS["svlog"](survey, folder)
-    data, offset = path.read_bytes(), 0
-    out = bytearray()
-    while offset < len(data):
-        length, kind = struct.unpack_from("<HH", data, offset + 2)
-        if kind != PROFILE or data[offset + PROFILE_CHANNEL] == list(Side).index(Side.PORT):
-            out += data[offset : offset + 10 + length]
-        offset += 10 + length
-    path.write_bytes(out)
-    return path
-
-
 LAYOUTS = {
     "xtf": make_xtf,
-    "xtf, a packet a side": lambda s, folder: in_packets(make_xtf(s, folder), 1, first=True),
-    "xtf, two frequencies": lambda s, folder: make_xtf(with_low_frequency(s), folder),
-    "xtf, a packet a frequency": lambda s, folder: in_packets(make_xtf(with_low_frequency(s), folder), 2, first=False),
     "jsf": MAKERS["jsf"],
     "sdf": MAKERS["sdf"],
     "sl2": MAKERS["sl2"],
     "sl3, version 10": MAKERS["sl3"],
     "sl3, version 13": version_13,
     "svlog": MAKERS["svlog"],
-    "svlog, one unit": one_unit,
     "humminbird": MAKERS["humminbird"],
 }
 
