@@ -23,7 +23,7 @@ from sonarpost.files import open_regular
 from sonarpost.messages import Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.input_folder import InputFile, list_input_files, printable
-from sonarpost.services.atd_stub.survey_detection import snippet_with_record
+from sonarpost.services.atd_stub.survey_detection import snippet_of
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.survey import Survey
 
@@ -96,7 +96,7 @@ def contacts_of_picks(
 
     def describe(survey: Survey, picked: PickedDetection, origin: PingOrigin) -> Snippet:
         record = picked.record(origin.file, vehicle_id, survey.sonar_id)
-        return snippet_with_record(survey, picked.detection, origin.file, record, config)
+        return snippet_of(survey, picked.detection, origin.file, record, config)
 
     snippets: list[Snippet] = []
     if new:

@@ -162,7 +162,8 @@ def _detect(
     """As `detect_in_survey`."""
 
     def describe(survey: Survey, detection: Detection, origin: PingOrigin) -> Snippet:
-        return snippet_of(survey, detection, origin.file, vehicle_id, config)
+        contact = contact_record(detection, origin.file, vehicle_id, survey.sonar_id)
+        return snippet_of(survey, detection, origin.file, contact, config)
 
     settings = config.detector_settings()
     settings = settings.model_copy(update={"max_contacts": min(settings.max_contacts or MAX_CONTACTS, MAX_CONTACTS)})
@@ -227,7 +228,7 @@ def snippets_of(contacts: Iterable[StreamContact[Snippet]]) -> tuple[Snippet, ..
 
 
 def snippet_of(
-    survey: Survey, detection: Detection, origin: FileOrigin, vehicle_id: str, config: AtdStubConfig
+    survey: Survey, detection: Detection, origin: FileOrigin, contact: Contact, config: AtdStubConfig
 ) -> Snippet:
     """Return the snippet of a detection, with an expanded image where the survey shows more seabed.
 
@@ -235,17 +236,9 @@ def snippet_of(
         survey: The pings in which it was detected.
         detection: The detection.
         origin: The file of its ping.
-        vehicle_id: This vehicle.
+        contact: Its contact record; the size of a pixel is added.
         config: Size of the image.
     """
-    contact = contact_record(detection, origin, vehicle_id, survey.sonar_id)
-    return snippet_with_record(survey, detection, origin, contact, config)
-
-
-def snippet_with_record(
-    survey: Survey, detection: Detection, origin: FileOrigin, contact: Contact, config: AtdStubConfig
-) -> Snippet:
-    """Return the snippet of a detection with its contact record, as `snippet_of`."""
     size = (config.snippet_height_px, config.snippet_width_px)
     cut = cut_snippet(survey, detection, *size)
     image, pixel_sizes = cut.image, {}

@@ -324,12 +324,6 @@ class StreamDetector(Generic[T]):
         return tuple(contact for sonar_id in tuple(self._ends) for contact in self.release(sonar_id))
 
 
-@dataclass(frozen=True, slots=True)
-class _Found(Generic[T]):
-    confidence: float
-    contact: StreamContact[T]
-
-
 class _FileSearch(Generic[T]):
     """The search of one file; `run` is called once and sets `result`. Row 0 is the first ping of `previous`."""
 
@@ -356,8 +350,9 @@ class _FileSearch(Generic[T]):
         self._held = [contact.place for contact in previous.held] if previous is not None else []
         self._repeated: set[int] = set()
         """Indices of the contacts held by `previous` that were detected again."""
-        self._decided: list[_Found[T]] = []
-        self._waiting: list[_Found[T]] = []
+        self._decided: list[tuple[float, StreamContact[T]]] = []
+        """Confidence and contact."""
+        self._waiting: list[tuple[float, StreamContact[T]]] = []
         self._weaker: Counter[float] = Counter()
         self._difficulties: list[StripDifficulty] = []
         self.result: FileResult[T]
@@ -403,15 +398,15 @@ class _FileSearch(Generic[T]):
                 if strip.is_last:
                     self._waiting.append(self._described(survey, detection, place))
         self._open_row, self._seen_rows = upper, end
-        self._decided.sort(key=_descending_confidence)
+        self._decided.sort(key=lambda found: -found[0])
         del self._decided[self._settings.max_contacts or len(self._decided) :]
         start = end - self._overlap
         self._reported = [place for place in self._reported if self._last_row(place) >= start]
 
-    def _described(self, survey: Survey, detection: Detection, place: DetectionPlace) -> _Found[T]:
+    def _described(self, survey: Survey, detection: Detection, place: DetectionPlace) -> tuple[float, StreamContact[T]]:
         origin = self._origin_of(place.row)
         content = self._describe(survey, detection, origin)
-        return _Found(detection.confidence, StreamContact(origin, place, content))
+        return detection.confidence, StreamContact(origin, place, content)
 
     def _origin_of(self, row: int) -> PingOrigin:
         if self._previous is not None and row < self._first_new_row:
@@ -423,13 +418,13 @@ class _FileSearch(Generic[T]):
         return max(place.end_row, place.row + math.ceil(self._settings.separation_along_m / place.along_m))
 
     def _finish(self, last: Strip) -> StreamEnd[T]:
-        both = sorted((*self._decided, *self._waiting), key=_descending_confidence)
-        waiting = {id(found) for found in self._waiting}
-        kept = both[: self._settings.max_contacts]
-        held = tuple(found.contact for found in kept if id(found) in waiting)
+        both = sorted((*self._decided, *self._waiting), key=lambda found: -found[0])
+        waiting = {id(contact) for _, contact in self._waiting}
+        kept = [contact for _, contact in both[: self._settings.max_contacts]]
+        held = tuple(contact for contact in kept if id(contact) in waiting)
         before = self._previous.held if self._previous is not None else ()
         self.result = FileResult(
-            contacts=tuple(found.contact for found in kept if id(found) not in waiting),
+            contacts=tuple(contact for contact in kept if id(contact) not in waiting),
             held=held,
             released=(),
             joined=self._previous is not None,
@@ -449,10 +444,6 @@ class _FileSearch(Generic[T]):
             reported=tuple(place.shifted(-start) for place in self._reported),
             held=tuple(replace(contact, place=contact.place.shifted(-start)) for contact in held),
         )
-
-
-def _descending_confidence(found: _Found[T]) -> float:
-    return -found.confidence
 
 
 def stored_ping_count(pings: Sequence[Ping], max_pings: int) -> int:

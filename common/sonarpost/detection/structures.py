@@ -14,6 +14,7 @@ length, or 20 m² of echoes in the water, and it increases with the area.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -64,15 +65,11 @@ def find_structures(grid: LevelGrid) -> list[Structure]:
     size = (max(1, round(_SMOOTH_M / grid.row_along_m)), max(1, round(_SMOOTH_M / grid.cell_across_m)))
     known = np.isfinite(grid.level)
     level = ndimage.uniform_filter(np.where(known, grid.level, 0.0).astype(np.float32), size=size, mode="nearest")
-    labels, _ = ndimage.label(known & (level < _DARK_LEVEL))
-    areas_m2 = np.bincount(labels.ravel()) * (grid.row_along_m * grid.cell_across_m)
     found = []
-    for number, box in enumerate(ndimage.find_objects(labels), start=1):
-        if box is None or areas_m2[number] < _MIN_AREA_M2:
-            continue
+    for box, dark, area_m2 in _regions(known & (level < _DARK_LEVEL), grid, _MIN_AREA_M2):
         if (box[0].stop - box[0].start) * grid.row_along_m > _MAX_LENGTH_M:
             continue
-        structure = _structure(grid, level, labels[box] == number, (box[0].start, box[1].start), areas_m2[number])
+        structure = _structure(grid, level, dark, (box[0].start, box[1].start), area_m2)
         if structure is not None:
             found.append(structure)
     weighted = [replace(s, confidence=s.confidence / (1 + _comparable(s, found, grid))) for s in found]
@@ -85,16 +82,11 @@ def find_water_structures(grid: LevelGrid) -> list[Structure]:
         return []
     size = (max(1, round(1.0 / grid.row_along_m)), max(1, round(_SMOOTH_M / grid.cell_across_m)))
     echo = ndimage.uniform_filter(grid.water_echo, size=size, mode="constant")
-    gap = [max(1, round(metres / pixel_m)) for metres, pixel_m in zip(_GAP_M, _pixel_m(grid), strict=True)]
+    gap = (max(1, round(_GAP_M[0] / grid.row_along_m)), max(1, round(_GAP_M[1] / grid.cell_across_m)))
     # Posts and beams echo as separate dashes of one structure.
-    labels, _ = ndimage.label(ndimage.binary_closing(echo > _WATER_ECHO, structure=np.ones(gap)))
-    areas_m2 = np.bincount(labels.ravel()) * (grid.row_along_m * grid.cell_across_m)
+    closed = ndimage.binary_closing(echo > _WATER_ECHO, structure=np.ones(gap))
     found = []
-    for number, box in enumerate(ndimage.find_objects(labels), start=1):
-        area_m2 = float(areas_m2[number])
-        if box is None or area_m2 < _MIN_WATER_AREA_M2:
-            continue
-        inside = labels[box] == number
+    for box, inside, area_m2 in _regions(closed, grid, _MIN_WATER_AREA_M2):
         row, cell = (int(v) for v in np.unravel_index(np.argmax(np.where(inside, echo[box], -np.inf)), inside.shape))
         strength = float(echo[box][inside].mean()) / _WATER_ECHO
         measurement = Measurement(
@@ -110,8 +102,15 @@ def find_water_structures(grid: LevelGrid) -> list[Structure]:
     return sorted(found, key=lambda s: -s.confidence)
 
 
-def _pixel_m(grid: LevelGrid) -> tuple[float, float]:
-    return grid.row_along_m, grid.cell_across_m
+def _regions(
+    mask: npt.NDArray[np.bool_], grid: LevelGrid, min_area_m2: float
+) -> Iterator[tuple[tuple[slice, slice], npt.NDArray[np.bool_], float]]:
+    """Yield bounding box, cells in it, and area in square metres of each connected region that is large enough."""
+    labels, _ = ndimage.label(mask)
+    areas_m2 = np.bincount(labels.ravel()) * (grid.row_along_m * grid.cell_across_m)
+    for number, box in enumerate(ndimage.find_objects(labels), start=1):
+        if box is not None and areas_m2[number] >= min_area_m2:
+            yield box, labels[box] == number, float(areas_m2[number])
 
 
 def is_part_of_structure(contact: Measurement, structure: Measurement, grid: LevelGrid) -> bool:
@@ -136,7 +135,7 @@ def _structure(
     level: npt.NDArray[np.float32],
     dark: npt.NDArray[np.bool_],
     corner: tuple[int, int],
-    area: np.float64,
+    area_m2: float,
 ) -> Structure | None:
     """Return the structure that casts a shadow; None if less than a quarter of its near edge is bright.
 
@@ -145,9 +144,8 @@ def _structure(
         level: Its smoothed levels.
         dark: The cells of the shadow within its bounding box.
         corner: First row and cell of that box.
-        area: Area of the shadow in square metres.
+        area_m2: Area of the shadow.
     """
-    area_m2 = float(area)
     reach = max(2, round(_EDGE_M / grid.cell_across_m))
     rows = np.flatnonzero(dark.any(axis=1))
     near = corner[1] + dark[rows].argmax(axis=1)

@@ -18,14 +18,14 @@ from sonarpost.detection.classifier import default_classifier
 from sonarpost.detection.detector import FilterScores, detect
 from sonarpost.detection.settings import DetectorSettings, DetectorTuning, load_settings
 from sonarpost.detection.snippets import ground_projected_image
-from sonarpost.detection.stream import FileOrigin
+from sonarpost.detection.stream import FileOrigin, contact_record
 from sonarpost.errors import ConfigError, SurveyFileError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.messages import Contact, Pixels, Snippet
+from sonarpost.services.atd_stub import survey_detection
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.input_folder import InputFile, StableFiles, list_input_files
 from sonarpost.services.atd_stub.snippet_files import read_snippet, write_snippet
-from sonarpost.services.atd_stub.survey_detection import snippet_of
 from sonarpost.sonar.image_files import read_image, write_tiff
 from sonarpost.sonar.options import ErrorBudget, Mounting
 from sonarpost.sonar.readers import open_survey
@@ -44,12 +44,17 @@ def line(tmp_path_factory) -> Path:
     return path
 
 
+def snippet_of(survey: Survey, detection, config: AtdStubConfig) -> Snippet:
+    contact = contact_record(detection, ORIGIN, "uuv-1", survey.sonar_id)
+    return survey_detection.snippet_of(survey, detection, ORIGIN, contact, config)
+
+
 def best_contact_of(path: Path, config: AtdStubConfig, change=lambda ping: ping):
     with open_survey(path, config) as source:
         survey = load_survey(source)
     survey = replace(survey, pings=tuple(change(ping) for ping in survey.pings))
     found = detect(survey, FEW, config)[0]
-    return survey, found, snippet_of(survey, found, ORIGIN, "uuv-1", config).contact
+    return survey, found, snippet_of(survey, found, config).contact
 
 
 # The record
@@ -78,7 +83,7 @@ def test_the_position_error_follows_from_the_configured_error_budget(line):
 def test_a_truncated_shadow_gives_no_height(line):
     survey, found, _ = best_contact_of(line, AtdStubConfig())
     cut = replace(found, shadow_is_cut=True)
-    contact = snippet_of(survey, cut, ORIGIN, "uuv-1", AtdStubConfig()).contact
+    contact = snippet_of(survey, cut, AtdStubConfig()).contact
     assert contact.height_m is None
     assert contact.shadow_m == found.shadow_m
 
@@ -190,7 +195,7 @@ def test_a_square_metre_is_a_centred_square_at_any_speed_and_altitude(along_m, a
 def test_the_expanded_image_shows_twice_the_ground(pixel_m, detection):
     survey = flat_survey()
     config = AtdStubConfig(snippet_height_px=60, snippet_width_px=60, snippet_pixel_m=pixel_m)
-    record = snippet_of(survey, contact_at(survey, 150, 12.0, detection), ORIGIN, "uuv-1", config)
+    record = snippet_of(survey, contact_at(survey, 150, 12.0, detection), config)
     sizes = []
     for raster in (record.pixels, record.wide):
         bright = np.argwhere(raster.to_array() > 128)
@@ -205,7 +210,7 @@ def test_the_expanded_image_shows_twice_the_ground(pixel_m, detection):
 def test_without_more_seabed_in_the_survey_there_is_no_expanded_image(detection):
     survey = flat_survey()
     config = AtdStubConfig(snippet_height_px=300, snippet_width_px=60)
-    assert snippet_of(survey, contact_at(survey, 150, 12.0, detection), ORIGIN, "uuv-1", config).wide is None
+    assert snippet_of(survey, contact_at(survey, 150, 12.0, detection), config).wide is None
 
 
 def test_unrecorded_seabed_is_black(detection):
@@ -230,7 +235,7 @@ def test_no_ground_projection_without_altitude_or_travel_or_with_tiny_pixels(det
 def test_the_record_has_the_pixel_size_of_its_image(line):
     survey, found, native = best_contact_of(line, AtdStubConfig())
     config = AtdStubConfig(snippet_pixel_m=0.05, snippet_height_px=64, snippet_width_px=96)
-    sent = snippet_of(survey, found, ORIGIN, "uuv-1", config)
+    sent = snippet_of(survey, found, config)
     assert (sent.contact.pixel_along_m, sent.contact.pixel_across_m) == (0.05, 0.05)
     assert (sent.pixels.height_px, sent.pixels.width_px) == (64, 96)
     assert (native.pixel_along_m, native.pixel_across_m) == (found.pixel_along_m, found.pixel_across_m)

@@ -7,7 +7,7 @@ from builders.joined_surveys import FEW_CANDIDATES
 
 from sonarpost.detection.detector import detect
 from sonarpost.detection.settings import DetectorSettings
-from sonarpost.detection.stream import FileOrigin
+from sonarpost.detection.stream import FileOrigin, contact_record
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.messages import Contact, Snippet
 from sonarpost.services.atd_stub.config import AtdStubConfig
@@ -51,7 +51,8 @@ def test_expand_of_a_detection_shows_twice_the_ground(start_service, encoded, co
     )
     origin = FileOrigin("ab" * 32, "line-7.xtf", "line-7")
     start_service(codec="emb", budget_bytes=4000)
-    [first] = encoded(snippet_of(survey, detection, origin, "uuv-1", AtdStubConfig()))
+    contact = contact_record(detection, origin, "uuv-1", survey.sonar_id)
+    [first] = encoded(snippet_of(survey, detection, origin, contact, AtdStubConfig()))
     expanded = command_over_the_link("expand", first.image_id)
     near, around = (emb.decode(image.stream).image.astype(float) for image in (first, expanded))
     assert around.shape == near.shape == (80, 140)
