@@ -8,9 +8,12 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
+from itertools import islice
 
 import numpy as np
 
+from builders.modem_fuzz import steps
 from sonarpost.link.config import ReceiverConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
@@ -21,6 +24,8 @@ from sonarpost.link.receiver import ImageUpdate, MessageReceived
 
 SMALL = ReceiverConfig(max_sources=3, max_contacts=20, block_memory_s=300.0, contact_memory_s=900.0)
 MESSAGE = b"status: "
+VEHICLE, STRANGER = 3, 4
+GENUINE_FRAMES = 250
 
 
 def image_stream(number: int) -> bytes:
@@ -143,6 +148,55 @@ def check_bounds(receiver: V1Receiver) -> None:
     assert all(n <= SMALL.max_contacts for group, n in groups.items() if group.startswith("image/"))
     assert all(n <= 32 for group, n in groups.items() if group.startswith(("block/", "rival/")))
     assert all(n <= 16 for group, n in groups.items() if group.startswith(("block-symbols/", "rival-symbols/")))
+
+
+@cache
+def _genuine() -> tuple[bytes, ...]:
+    return tuple(islice(genuine(1), GENUINE_FRAMES))
+
+
+def check(data: bytes) -> int:
+    """Pass frames of an input to a receiver; return the number of image updates and messages.
+
+    The steps of an input are those of `builders.modem_fuzz`.
+
+    A stranger sends the input's bytes, with correct checksums or without. Between them, genuine frames of a vehicle
+    arrive in any order and number; updates of the vehicle must hold what it sent. Feedback, the state and its bounds
+    are checked at the end.
+
+    Raises:
+        AssertionError: A property does not hold.
+    """
+    receiver, now, reported = V1Receiver(SMALL), 0.0, 0
+    for kind, body in steps(data):
+        now += (0.0, 1.0, 70.0, 4000.0)[kind >> 2 & 3]
+        if kind & 3 == 0:
+            frames = [(VEHICLE, _genuine()[number % GENUINE_FRAMES]) for number in body]
+        elif kind & 3 == 1:
+            frames = [(STRANGER, body)]
+        else:
+            frames = [(STRANGER, bytes(with_checksum(body)))]
+        for source, frame in frames:
+            for event in receiver.accept(source, frame, now):
+                assert source == STRANGER or is_right(event), f"reported but never sent: {event}"
+                reported += isinstance(event, ImageUpdate | MessageReceived)
+        for source in receiver.sources:
+            if receiver.feedback_is_due(source, now):
+                feedback = receiver.feedback(source, now)
+                assert feedback is None or len(feedback.pack()) <= 19
+    check_bounds(receiver)
+    restored = V1Receiver(SMALL)
+    assert not restored.restore(receiver.parts())
+    assert restored.parts() == receiver.parts()
+    return reported
+
+
+def seeds() -> Iterator[bytes]:
+    """Yield first inputs of `check` that cover genuine traffic."""
+    frames = _genuine()
+    for first in range(0, GENUINE_FRAMES, 25):
+        yield bytes([0, 25, *range(first, first + 25)])
+        yield b"".join(bytes([2 | first % 3 << 2, len(f) - 2]) + f[2:] for f in frames[first : first + 8])
 
 
 def main(arguments: list[str]) -> None:

@@ -74,9 +74,10 @@ def surveys(names):
 
 def link(target):
     """Return the same for the acoustic link."""
-    from builders.link_oracle import CHECKS, seeds
+    from builders import modem_fuzz, v1_fuzz
 
-    return CHECKS[target], seeds(target), 4096
+    fuzzed = {"receiver": v1_fuzz, "driver": modem_fuzz}[target]
+    return fuzzed.check, fuzzed.seeds(), 4096
 
 
 def main():
