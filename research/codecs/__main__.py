@@ -55,6 +55,7 @@ def new_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the simulated images (default: 0)")
     add_codec_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
     add_strength_argument(parser)
     parser.add_argument(
         "--details", type=Path, metavar="FILE.json", help="write all figures: intervals, misses, variants"

@@ -58,12 +58,11 @@ def report_progress(step: str) -> None:
 
 
 def add_codec_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options for codecs, budgets and output."""
+    """Add the options for codecs and budgets."""
     parser.add_argument(
         "--budgets", default=DEFAULT_BUDGETS, metavar="B,B,…", help="maximum bytes of a stream (default: %(default)s)"
     )
     parser.add_argument("--codecs", metavar="NAME,…", help="default: all that are available")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
 
 
 def add_strength_argument(parser: argparse.ArgumentParser) -> None:

@@ -1,7 +1,6 @@
 """`python -m research.despeckling`: the network of emb against classical filters, alone and as the input of emb."""
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Sequence
@@ -49,7 +48,6 @@ def new_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--sdvd", type=Path, metavar="DIR", help="also measure crops of the SDVD data set's test split")
     parser.add_argument("--sheet", type=Path, metavar="FILE.png", help="draw simulated snippets as decoded")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
     return parser
 
 
@@ -61,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         OSError: A file cannot be written.
     """
     budgets = parse_budgets(args.budgets)
-    filters = create_filters(_filter_names(args.filters))
+    filters = create_filters(filter_names(args.filters))
     if args.sheet is not None:
         in_new_folder(args.sheet)
     crops = () if args.sdvd is None else sdvd_crops(args.sdvd).images
@@ -78,14 +76,16 @@ def run(args: argparse.Namespace) -> int:
         if each.function is not None:
             recordings.append(measure_recordings(each, crops, budgets))
             report_progress(f"{each.name}: {len(crops)} crops")
-    if args.json:
-        print(json_line(results, recordings, len(pairs), args.seed))
-    else:
-        print(text(results, recordings, budgets, len(pairs)))
+    print(text(results, recordings, budgets, len(pairs)))
     return 0
 
 
-def _filter_names(names: str | None) -> tuple[str, ...]:
+def filter_names(names: str | None) -> tuple[str, ...]:
+    """Return the names of classical filters, separated by commas; all for None, none for `none`.
+
+    Raises:
+        ConfigError: A name is unknown.
+    """
     if names is None:
         return tuple(FILTERS)
     if names == "none":
@@ -95,35 +95,6 @@ def _filter_names(names: str | None) -> tuple[str, ...]:
         if name not in FILTERS:
             raise ConfigError("research", "--filters", name, f"none, or some of {', '.join(FILTERS)}")
     return found
-
-
-def json_line(
-    results: Sequence[FilterResult], recordings: Sequence[Sequence[RecordingRow]], pairs: int, seed: int
-) -> str:
-    """Return the JSON object: one row for each filter and budget; budget null for the filtered image itself."""
-    rows = [
-        {
-            "filter": result.name,
-            "budget": row.budget_bytes,
-            "filter_ms": _rounded(result.filter_ms, 2),
-            "misses": row.misses,
-            **{name: _rounded(value, 4) for name, value in row.figures.items()},
-        }
-        for result in results
-        for row in result.rows
-    ]
-    real = [
-        {
-            "filter": row.name,
-            "budget": row.budget_bytes,
-            "dots_with_target": _rounded(row.dots_with_target, 3),
-            "dots_without_target": _rounded(row.dots_without_target, 3),
-            "original_psnr": _rounded(row.original_psnr, 4),
-        }
-        for rows_of_filter in recordings
-        for row in rows_of_filter
-    ]
-    return json.dumps({"pairs": pairs, "seed": seed, "results": rows, "sdvd": real}, allow_nan=False)
 
 
 def text(
@@ -179,10 +150,6 @@ def _recording_table(recordings: Sequence[Sequence[RecordingRow]], budgets: Sequ
 
     head = ("filter", "filtered", *(f"{budget} B" for budget in budgets))
     return aligned([head, *((rows[0].name, *(cell(row) for row in rows)) for rows in recordings)])
-
-
-def _rounded(value: float, digits: int) -> float | None:
-    return round(value, digits) if math.isfinite(value) else None
 
 
 def _fixed(value: float, digits: int) -> str:

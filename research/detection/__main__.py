@@ -68,6 +68,7 @@ def new_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--plot", type=Path, metavar="DIR", help="write plots into this folder")
     add_codec_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
     return parser
 
 

@@ -1,7 +1,6 @@
 """`python -m research.recognition`: how well a classifier trained on originals recognises targets after coding."""
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -27,12 +26,10 @@ from research.common.measurement import CodecUnderTest, code_image
 from research.common.statistics import Interval, Values, auc, bootstrap_weights, interval
 from research.recognition.classifier import DEFAULT_GRAIN_STRENGTH, TargetClassifier, codec_with_grain, with_grain
 from sonarpost.codec.interface import Image
-from sonarpost.errors import ConfigError
 
 MIN_AUC: Final = 0.93
 """Minimum AUC of the classifier on originals for a valid result."""
 EXIT_POOR_CLASSIFIER: Final = 1
-MAX_STRENGTH: Final = 2.0
 _SIMULATED: Final = 240
 _SIMULATED_SEED: Final = 1  # not that of `research.codecs`
 
@@ -48,24 +45,10 @@ def new_parser() -> argparse.ArgumentParser:
         ".03 are not significant.",
     )
     parser.add_argument("--sdvd", type=Path, required=True, metavar="DIR", help="folder of the SDVD data set")
-    parser.add_argument("--crop", type=int, default=80, metavar="PX", help="side of the crops (default: 80)")
     add_codec_arguments(parser)
     add_strength_argument(parser)
     parser.add_argument(
         "--simulated", type=int, default=_SIMULATED, metavar="N", help="simulated training images (%(default)s)"
-    )
-    parser.add_argument(
-        "--least-auc",
-        type=float,
-        default=MIN_AUC,
-        metavar="AUC",
-        help="minimum AUC on originals (%(default)s)",
-    )
-    parser.add_argument(
-        "--grain-strength",
-        default=str(DEFAULT_GRAIN_STRENGTH),
-        metavar="S,S,…",
-        help="shares of the synthetic texture, 0..2 (default: %(default)s)",
     )
     return parser
 
@@ -76,7 +59,6 @@ class RecognitionResult:
 
     Attributes:
         label: Codec and variant; "original" for the originals.
-        codec: Name in the registry; empty for the originals.
         budget_bytes: Maximum bytes of a stream; None for a natural size and for the originals.
         grain: Share of the synthetic texture added; None without description of the texture.
         mean_bytes: Mean length of a stream; NaN for the originals.
@@ -89,7 +71,6 @@ class RecognitionResult:
     """
 
     label: str
-    codec: str
     budget_bytes: int | None
     grain: float | None
     mean_bytes: float
@@ -101,56 +82,42 @@ class RecognitionResult:
     share_ci: Interval | None
 
 
-def run(args: argparse.Namespace) -> int:
-    """Train, classify and report; return 0, or 1 if the classifier is too poor on the originals.
+def measure(args: argparse.Namespace) -> list[RecognitionResult]:
+    """Train and classify; return the result of the originals, then those of each codec and budget.
 
     Raises:
         SonarpostError: Invalid options, data set or codecs.
     """
     budgets = parse_budgets(args.budgets)
-    if not 0.0 <= args.least_auc <= 1.0:
-        raise ConfigError("research", "--least-auc", args.least_auc, "0..1")
-    strengths = _parse_strengths(args.grain_strength)
     tested = selected_codecs(args, all_packings=False)
-    training = sdvd_crops(args.sdvd, "train", args.crop).images
-    test = sdvd_crops(args.sdvd, "test", args.crop).images
-    simulated = simulated_images(args.simulated, _SIMULATED_SEED, args.crop).images if args.simulated else ()
+    training, test = (sdvd_crops(args.sdvd, split).images for split in ("train", "test"))
+    simulated = simulated_images(args.simulated, _SIMULATED_SEED).images if args.simulated else ()
     report_progress(f"training on {len(training)} real and {len(simulated)} simulated images")
     groups = [image.group for image in test]
     evaluation = _Evaluation(TargetClassifier(training, simulated, groups), test, bootstrap_weights(groups))
-    originals = evaluation.result([image.pixels for image in test], _Coding("original", "", None, None))
-    results = [originals]
+    results = [evaluation.result([image.pixels for image in test], _Coding("original", None, None))]
     for codec in tested:
-        results += _codec_results(evaluation, codec, budgets, strengths)
+        results += _codec_results(evaluation, codec, budgets)
         report_progress(f"{codec.label}: classified")
-    print(_json_line(results, len(test)) if args.json else _table(results))
-    if originals.area is None or originals.area < args.least_auc:
+    return results
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure and report; return 0, or 1 if the classifier is too poor on the originals."""
+    results = measure(args)
+    print(_table(results))
+    if results[0].area is None or results[0].area < MIN_AUC:
         warn(
-            f"AUC of the classifier on originals: got {originals.area}, expected at least {args.least_auc}; "
+            f"AUC of the classifier on originals: got {results[0].area}, expected at least {MIN_AUC}; "
             "the results are not valid"
         )
         return EXIT_POOR_CLASSIFIER
     return 0
 
 
-def _parse_strengths(text: str) -> tuple[float, ...]:
-    """Parse `0.5,1`; return the strengths in rising order without duplicates."""
-    found = set()
-    for part in text.split(","):
-        try:
-            strength = float(part)
-        except ValueError:
-            strength = math.nan
-        if not 0.0 <= strength <= MAX_STRENGTH:
-            raise ConfigError("research", "--grain-strength", part, f"numbers 0..{MAX_STRENGTH}, separated by commas")
-        found.add(strength)
-    return tuple(sorted(found))
-
-
 @dataclass(frozen=True)
 class _Coding:
     label: str
-    codec: str
     budget_bytes: int | None
     grain: float | None
 
@@ -193,7 +160,6 @@ class _Evaluation:
         count = int(np.count_nonzero(coded))
         return RecognitionResult(
             coding.label,
-            coding.codec,
             coding.budget_bytes,
             coding.grain,
             math.nan if lengths is None or not count else float(lengths[coded].mean()),
@@ -206,9 +172,7 @@ class _Evaluation:
         )
 
 
-def _codec_results(
-    evaluation: _Evaluation, tested: CodecUnderTest, budgets: Sequence[int], strengths: Sequence[float]
-) -> list[RecognitionResult]:
+def _codec_results(evaluation: _Evaluation, tested: CodecUnderTest, budgets: Sequence[int]) -> list[RecognitionResult]:
     """Return the results at every budget, then those of streams with a description of the texture.
 
     The description is part of the same budget, so it reduces the bytes of the image.
@@ -220,12 +184,11 @@ def _codec_results(
     if grain_codec is None:
         return results
     for coding, images, streams, lengths in _coded(evaluation.test, replace(tested, codec=grain_codec), budgets):
-        for strength in strengths:
-            textured = [
-                None if image is None or stream is None else with_grain(grain_codec, stream, image, strength)
-                for image, stream in zip(images, streams, strict=True)
-            ]
-            results.append(evaluation.result(textured, replace(coding, grain=strength), lengths))
+        textured = [
+            None if image is None or stream is None else with_grain(grain_codec, stream, image)
+            for image, stream in zip(images, streams, strict=True)
+        ]
+        results.append(evaluation.result(textured, replace(coding, grain=DEFAULT_GRAIN_STRENGTH), lengths))
     return results
 
 
@@ -238,37 +201,11 @@ def _coded(
         results = [each[column] for each in coded]
         budget = None if tested.is_natural else budgets[column]
         yield (
-            _Coding(tested.label, tested.name, budget, None),
+            _Coding(tested.label, budget, None),
             [None if isinstance(r, str) else r.decoded for r in results],
             [None if isinstance(r, str) else r.stream for r in results],
             np.array([math.nan if isinstance(r, str) else float(len(r.stream)) for r in results]),
         )
-
-
-def _json_line(results: Sequence[RecognitionResult], images: int) -> str:
-    originals, *others = results
-    rows = [
-        {
-            "codec": r.codec,
-            "label": r.label,
-            "budget": r.budget_bytes,
-            "grain": r.grain,
-            "bytes": None if math.isnan(r.mean_bytes) else round(r.mean_bytes, 2),
-            "n": r.images,
-            "misses": r.misses,
-            "auc": None if r.area is None else round(r.area, 4),
-            "ci": _rounded(r.ci),
-            "of_original": None if r.share is None else round(r.share, 4),
-            "of_original_ci": _rounded(r.share_ci),
-        }
-        for r in others
-    ]
-    judge = {"auc": originals.area, "ci": None if originals.ci is None else list(originals.ci)}
-    return json.dumps({"images": images, "judge": judge, "results": rows}, allow_nan=False)
-
-
-def _rounded(found: Interval | None) -> list[float] | None:
-    return None if found is None else [round(found[0], 4), round(found[1], 4)]
 
 
 def _table(results: Sequence[RecognitionResult]) -> str:

@@ -1,7 +1,6 @@
-"""`python -m research.despeckling`: figures, tables, the JSON object and the sheet."""
+"""`python -m research.despeckling`: figures, tables and the sheet."""
 
 import dataclasses
-import json
 import math
 
 import numpy as np
@@ -11,7 +10,7 @@ from PIL import Image
 from research.common import images as image_sets
 from research.common.speckle import SpecklePair, speckle_pairs
 from research.despeckling import __main__ as command
-from research.despeckling.measurement import create_filters, measure_pairs
+from research.despeckling.measurement import create_filters, measure_pairs, measure_recordings
 
 
 @pytest.fixture(scope="module")
@@ -45,21 +44,19 @@ def run(*arguments: object) -> int:
     return command.run(command.new_parser().parse_args([str(argument) for argument in arguments]))
 
 
-@pytest.mark.usefixtures("few_pairs")
-def test_json_object_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("--count", 2, "--filters", "lee", "--budgets", "4,48", "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert (found["pairs"], found["seed"], found["sdvd"]) == (2, 0, [])
+def test_every_filter_has_a_row_for_each_budget(pairs: list[SpecklePair]) -> None:
+    filters = create_filters(command.filter_names("lee"))
     names = ["none", "network 0.25", "network 0.5", "network 0.75", "network 1", "lee", "oracle"]
-    assert [row["filter"] for row in found["results"]] == [name for name in names for _ in range(3)]
-    for row in found["results"]:
-        if row["budget"] == 4:
-            assert row["misses"] == 2
-            assert row["clean_psnr"] is None
-        else:
-            assert row["misses"] == 0
-            assert 10 < row["clean_psnr"] <= 60
-            assert row["dots"] >= 0
+    assert [each.name for each in filters] == names
+    for each in filters:
+        filtered, small, large = measure_pairs(each, pairs[:2], [4, 48]).rows
+        assert (filtered.budget_bytes, small.budget_bytes, large.budget_bytes) == (None, 4, 48)
+        assert small.misses == 2
+        assert math.isnan(small.figures["clean_psnr"])
+        for row in (filtered, large):
+            assert row.misses == 0
+            assert 10 < row.figures["clean_psnr"] <= 60
+            assert row.figures["dots"] >= 0
 
 
 @pytest.mark.usefixtures("few_pairs")
@@ -84,9 +81,11 @@ def test_network_removes_dots_from_recordings(data_dir, monkeypatch, capsys):
     few = dataclasses.replace(crops, images=crops.images[::28])
     monkeypatch.setattr(command, "sdvd_crops", lambda _: few)
     folder = data_dir / "snippets" / "sdvd"
-    assert run("--count", 1, "--filters", "none", "--budgets", "128", "--sdvd", folder, "--json") == 0
-    rows = {(row["filter"], row["budget"]): row for row in json.loads(capsys.readouterr().out)["sdvd"]}
-    assert {name for name, _ in rows} == {"none", "network 0.25", "network 0.5", "network 0.75", "network 1"}
+    assert run("--count", 1, "--filters", "none", "--budgets", "128", "--sdvd", folder) == 0
+    assert "Isolated dots in a crop of recordings" in capsys.readouterr().out
+    filters = [each for each in create_filters([]) if each.function is not None]
+    assert [each.name for each in filters] == ["none", "network 0.25", "network 0.5", "network 0.75", "network 1"]
+    none, network = (measure_recordings(each, few.images, [128]) for each in (filters[0], filters[-1]))
     for name in ("dots_with_target", "dots_without_target"):
-        assert rows["network 1", 128][name] < rows["none", 128][name]
-    assert rows["none", None]["original_psnr"] == 60
+        assert getattr(network[1], name) < getattr(none[1], name)
+    assert none[0].original_psnr == 60

@@ -1,7 +1,6 @@
 """`python -m research.paper` and `python -m research.recognition` with small data sets."""
 
 import csv
-import json
 from pathlib import Path
 from types import ModuleType
 
@@ -102,18 +101,16 @@ def data_set(tmp_path: Path) -> Path:
 
 def test_recognition_results_of_decoded_images(data_set: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--sdvd", data_set, "--codecs", "spiht,jpeg2000", "--budgets", "12,128", "--simulated", "0"]
-    assert run(recognition, *options, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert set(found) == {"images", "judge", "results"}
-    assert found["images"] == 12
-    assert found["judge"]["auc"] >= 0.93
-    rows = {(r["codec"], r["budget"]): r for r in found["results"]}
+    originals, *others = recognition.measure(recognition.new_parser().parse_args([*map(str, options)]))
+    assert originals.images == 12
+    assert originals.area >= 0.93
+    rows = {(one.label, one.budget_bytes): one for one in others}
     assert set(rows) == {("spiht", 12), ("spiht", 128), ("jpeg2000", 12), ("jpeg2000", 128)}
-    assert rows["jpeg2000", 12]["misses"] == 12
-    assert rows["jpeg2000", 12]["auc"] is None
-    assert rows["spiht", 128]["n"] == 12
-    low, high = rows["spiht", 128]["ci"]
-    assert 0 <= low <= rows["spiht", 128]["auc"] <= high <= 1
+    assert rows["jpeg2000", 12].misses == 12
+    assert rows["jpeg2000", 12].area is None
+    assert rows["spiht", 128].images == 12
+    low, high = rows["spiht", 128].ci
+    assert 0 <= low <= rows["spiht", 128].area <= high <= 1
     assert run(recognition, *options) == 0
     assert "original" in capsys.readouterr().out
 
