@@ -25,6 +25,10 @@ def test_commit_waits_for_the_disk_and_deleted_records_are_not_overwritten(store
     """FULL (2) makes SQLite wait for the disk at each commit of a write-ahead log; NORMAL (1) does not."""
     settings = [store._query(f"PRAGMA {name}")[0][0] for name in ("synchronous", "journal_mode", "secure_delete")]
     assert settings == [2, "wal", 0]
+    for durable in (False, True):
+        with store.transaction(durable=durable) as tx:
+            tx.put_state("name", b"")
+        assert store._query("PRAGMA synchronous") == [(1 + durable,)]
 
 
 def test_store_is_locked_by_one_process(store):
