@@ -77,7 +77,7 @@ AREAS = {
     "encode": ("sonarpost/wire.py", "encode"),
     "log_line": ("logging/__init__.py", "info"),
     "commit_queued": ("runtime/service.py", "commit_batch"),
-    "outbox_thread": ("delivery/outbox.py", "_run"),
+    "outbox_thread": ("delivery/queue_sender.py", "_run"),
     "outbox_thread_versions": ("relay/service.py", "on_acknowledged"),
 }
 """Areas of the relay's work: the function, with all that it calls. The contact is a part of `build_part`, the stored
