@@ -55,12 +55,8 @@ def add_options(parser: CommandParser) -> None:
     parser.set_defaults(run=run)
 
 
-def run(parsed: argparse.Namespace, console: Console | None = None) -> int:
+def run(parsed: argparse.Namespace) -> int:
     """Show the state of the fleet; return 0, or with --once 1 if a service is not ok.
-
-    Args:
-        parsed: The command line.
-        console: Output; by default standard output.
 
     Raises:
         ConfigError: A router option or a time is invalid.
@@ -70,7 +66,7 @@ def run(parsed: argparse.Namespace, console: Console | None = None) -> int:
             raise ConfigError("status", f"--{name.replace('_', '-')}", getattr(parsed, name), "above 0, to 86400")
     endpoints, tls = router_of(parsed)
     router = ", ".join(endpoints)
-    console = console or Console(highlight=False)
+    console = Console(highlight=False)
     with (
         _logging_suppressed(),
         stop_on_signals() as stop,

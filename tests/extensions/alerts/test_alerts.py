@@ -12,7 +12,9 @@ import subprocess
 import sys
 import threading
 from contextlib import closing
+from functools import partial
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from types import SimpleNamespace
 
 import pytest
 from builders.common import WAIT_S, eventually, free_port
@@ -25,9 +27,10 @@ from paho.mqtt.enums import CallbackAPIVersion
 from sonarpost.cli.main import main
 from sonarpost.errors import DeliveryError, PortError
 from sonarpost.export.live import LiveContacts
-from sonarpost.extensions.alerts import command
+from sonarpost.extensions.alerts import command, senders
 from sonarpost.extensions.alerts.command import AlertService, SentAlerts, alert_document, needs_alert, score
 from sonarpost.extensions.alerts.senders import AlertNotAcceptedError, AlertRefusedError, AlertWebhook, Mqtt, signature
+from sonarpost.network import http_client
 from sonarpost.security.client_tls import TlsFiles
 from sonarpost.security.fleet import CA_CERTIFICATE, CERTIFICATE, KEY, Fleet
 
@@ -106,7 +109,8 @@ def test_failed_alert_is_repeated_and_a_refused_one_is_not(tmp_path):
 
 def test_waiting_alerts_and_state_are_limited(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(command, "MAX_WAITING", 2)
-    sent = SentAlerts(tmp_path / "state.db", max_rows=2)
+    monkeypatch.setattr(command, "MAX_SENT", 2)
+    sent = SentAlerts(tmp_path / "state.db")
     sender = Alerts()
     service = AlertService(sender, sent, 0.5)
     for n in range(3):
@@ -254,9 +258,10 @@ def test_status_of_the_receiver(status, error, hook):
     assert "X-Sonarpost-Signature" not in hook.received[0][1]
 
 
-def test_silent_receiver_is_given_up():
+def test_silent_receiver_is_given_up(monkeypatch):
+    monkeypatch.setattr(senders, "http_client", SimpleNamespace(post=partial(http_client.post, timeout_s=0.01)))
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        webhook = AlertWebhook(f"http://127.0.0.1:{silent.getsockname()[1]}", TlsFiles(), None, timeout_s=0.01)
+        webhook = AlertWebhook(f"http://127.0.0.1:{silent.getsockname()[1]}", TlsFiles(), None)
         with pytest.raises(PortError, match="not sent"):
             webhook.send("id", "vessel-1", b"{}")
 
@@ -342,7 +347,7 @@ def broker(tmp_path):
     process.wait()
 
 
-def test_mqtt_alert_reaches_a_subscriber(broker):
+def test_mqtt_alert_reaches_a_subscriber(broker, monkeypatch):
     port, process = broker
     received = []
     subscribed = threading.Event()
@@ -361,7 +366,8 @@ def test_mqtt_alert_reaches_a_subscriber(broker):
         eventually(lambda: received == [("mines/alerts/vessel-1", body, 1)])
         client.disconnect()
         client.loop_stop()
-        wrong = Mqtt(f"mqtt://ben@127.0.0.1:{port}/mines/alerts", TlsFiles(), SECRET, timeout_s=0.5)
+        wrong = Mqtt(f"mqtt://ben@127.0.0.1:{port}/mines/alerts", TlsFiles(), SECRET)
+        monkeypatch.setattr(senders, "TIMEOUT_S", 0.5)
         with pytest.raises(PortError, match="not"):
             wrong.send("id", "vessel-1", body)
         process.kill()

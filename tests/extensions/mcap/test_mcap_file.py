@@ -87,8 +87,9 @@ def test_a_recording_that_was_never_closed_is_readable_up_to_its_last_chunk(tmp_
     assert [next(messages).time_ns for _ in range(3)] == [0, 1, 2]
 
 
-def test_recording_continues_in_a_new_file(tmp_path):
-    recording = McapRecording(tmp_path / "a.mcap", part_bytes=2000)
+def test_recording_continues_in_a_new_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(mcap_file, "PART_BYTES", 2000)
+    recording = McapRecording(tmp_path / "a.mcap")
     for message in samples():
         recording.write(message.key, message.encoding, message.payload, message.time_ns)
         recording.flush()

@@ -234,8 +234,9 @@ def test_a_stopped_replay_ends():
     assert list(paced([message(0), message(1)], 1.0, lambda _: True)) == []
 
 
-def test_full_queue_drops_and_counts():
-    waiting = RecordQueue(max_bytes=10)
+def test_full_queue_drops_and_counts(monkeypatch):
+    monkeypatch.setattr("sonarpost.extensions.mcap.record.MAX_QUEUED_BYTES", 10)
+    waiting = RecordQueue()
     for n in range(4):
         waiting.add(message(n, b"1234"))
     assert (len(waiting.take(0)), waiting.dropped) == (2, 2)

@@ -117,19 +117,21 @@ def test_failures_are_tried_again():
     assert len(sender.batches[1]) == 2
 
 
-def test_memory_is_limited():
+def test_memory_is_limited(monkeypatch):
+    monkeypatch.setattr(command, "MAX_NAMES", MAX_IMAGES + 10)
     sender, clock = Events(), Clock()
     files = Files([])
-    service = CotService(sender, files, clock=clock, max_contacts=MAX_IMAGES + 10)
+    service = CotService(sender, files, clock=clock)
     for n in range(MAX_IMAGES + 30):
         service.add(ContactChange(contact_of(f"{n:04}"), b"png"))
     assert service.send_due() == MAX_IMAGES + 10
     assert len(files.names) == MAX_IMAGES
 
 
-def test_contacts_and_images_have_places_by_vessel():
+def test_contacts_and_images_have_places_by_vessel(monkeypatch):
+    monkeypatch.setattr(command, "MAX_NAMES", MAX_IMAGES)
     sender, files = Events(), Files([])
-    service = CotService(sender, files, clock=Clock(), max_contacts=MAX_IMAGES)
+    service = CotService(sender, files, clock=Clock())
     service.add(ContactChange(contact_of("0000"), b"png"))
     for n in range(MAX_IMAGES + 30):
         service.add(ContactChange(contact_of(f"{n:04}", "vessel-2"), b"png"))

@@ -110,9 +110,8 @@ class SentAlerts(SqliteFile):
         DeliveryError: It cannot be opened, or is no such file.
     """
 
-    def __init__(self, path: Path, max_rows: int = MAX_SENT) -> None:
+    def __init__(self, path: Path) -> None:
         super().__init__(path, _SCHEMA, version=1)
-        self._max_rows = max_rows
 
     def __contains__(self, alert_id: str) -> bool:
         with self.read() as db:
@@ -126,7 +125,7 @@ class SentAlerts(SqliteFile):
         """
         with self.transaction() as db:
             cursor = db.execute("INSERT OR IGNORE INTO sent (id) VALUES (?)", (alert_id,))
-            db.execute("DELETE FROM sent WHERE number <= ?", ((cursor.lastrowid or 0) - self._max_rows,))
+            db.execute("DELETE FROM sent WHERE number <= ?", ((cursor.lastrowid or 0) - MAX_SENT,))
 
 
 @dataclass(slots=True)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from paho.mqtt.client import Client
 
 TIMEOUT_S: Final = 10.0
+"""Time limit of the connection to a broker, and of its acknowledgement."""
 MIN_SECRET_BYTES: Final = 16
 REFUSED_STATUS: Final = (400, 413, 422)
 """Replies that another attempt cannot change."""
@@ -58,26 +59,17 @@ class AlertWebhook:
         url: `https://…` or `http://…`.
         tls: PEM files for `https`.
         secret: Key of the signature; None sends none.
-        timeout_s: Time limit of the whole exchange.
         stop: Ends an exchange.
 
     Raises:
         ConfigError: The address or a file is invalid.
     """
 
-    def __init__(
-        self,
-        url: str,
-        tls: TlsFiles,
-        secret: bytes | None,
-        timeout_s: float = http_client.TIMEOUT_S,
-        stop: threading.Event | None = None,
-    ) -> None:
+    def __init__(self, url: str, tls: TlsFiles, secret: bytes | None, stop: threading.Event | None = None) -> None:
         parts = _split("--webhook", url, ("http", "https"))
         self._url = url
         self._netloc = parts.netloc
         self._secret = secret
-        self._timeout_s = timeout_s
         self._context = tls.context() if parts.scheme == "https" else None
         self._stop = stop
 
@@ -95,9 +87,7 @@ class AlertWebhook:
         if self._secret is not None:
             headers["X-Sonarpost-Signature"] = signature(self._secret, timestamp, body)
         try:
-            reply = http_client.post(
-                self._url, body, headers, context=self._context, timeout_s=self._timeout_s, stop=self._stop
-            )
+            reply = http_client.post(self._url, body, headers, context=self._context, stop=self._stop)
         except OSError as error:
             raise PortError(f"{self._netloc}: alert not sent: {str(error) or type(error).__name__}") from error
         if reply.status in REFUSED_STATUS:
@@ -116,14 +106,13 @@ class Mqtt:
         url: `mqtt://host[:1883]/topic` or `mqtts://host[:8883]/topic`, with a user name before the host if needed.
         tls: PEM files for `mqtts`.
         password: Password of the user.
-        timeout_s: Time limit of connection and acknowledgement.
 
     Raises:
         ConfigError: The address or a file is invalid.
         ModuleNotFoundError: The extra `mqtt` is not installed.
     """
 
-    def __init__(self, url: str, tls: TlsFiles, password: bytes | None, timeout_s: float = TIMEOUT_S) -> None:
+    def __init__(self, url: str, tls: TlsFiles, password: bytes | None) -> None:
         # Imported lazily: it needs the extra `mqtt`.
         from paho.mqtt.client import Client  # noqa: PLC0415
         from paho.mqtt.enums import CallbackAPIVersion  # noqa: PLC0415
@@ -137,7 +126,6 @@ class Mqtt:
             raise ConfigError("c2 alert", "--mqtt", url, "a topic without wildcards behind the host")
         self._context: ssl.SSLContext | None = tls.context() if parts.scheme == "mqtts" else None
         self._password = password
-        self._timeout_s = timeout_s
         self._client: Client | None = None
 
     def send(self, alert_id: str, vessel_id: str, body: bytes) -> None:
@@ -150,27 +138,27 @@ class Mqtt:
         try:
             client = self._connected()
             published = client.publish(f"{self._topic}/{vessel_id}", body, qos=1)
-            published.wait_for_publish(self._timeout_s)
+            published.wait_for_publish(TIMEOUT_S)
             is_published = published.is_published()
         except (OSError, ValueError, RuntimeError) as error:
             self.close()
             raise PortError(f"{self._host}:{self._port}: alert not published: {error}") from error
         if not is_published:
             self.close()
-            raise PortError(f"{self._host}:{self._port}: alert not acknowledged within {self._timeout_s:g} s")
+            raise PortError(f"{self._host}:{self._port}: alert not acknowledged within {TIMEOUT_S:g} s")
 
     def _connected(self) -> "Client":
         if self._client is not None and self._client.is_connected():
             return self._client
         self.close()
         client = self._new_client(client_id=f"sonarpost-{uuid.uuid4().hex[:12]}")
-        client.connect_timeout = self._timeout_s
+        client.connect_timeout = TIMEOUT_S
         if self._user:
             client.username_pw_set(self._user, None if self._password is None else self._password.decode())
         if self._context is not None:
             client.tls_set_context(self._context)
         # It limits the TLS handshake as well.
-        client.connect(self._host, self._port, keepalive=max(1, round(self._timeout_s)))
+        client.connect(self._host, self._port, keepalive=max(1, round(TIMEOUT_S)))
         self._client = client
         client.loop_start()
         return client

@@ -48,21 +48,19 @@ class McapFileError(BadInputError):
 
 
 class McapRecording:
-    """Writes records into an MCAP file, and into further files `NAME.0002.mcap`, … after `part_bytes`.
+    """Writes records into an MCAP file, and into further files `NAME.0002.mcap`, … after `PART_BYTES`.
 
     Args:
         path: The first file; it must not exist.
-        part_bytes: Size at which a further file begins.
 
     Raises:
         FileExistsError: The file exists.
         OSError: It cannot be written.
     """
 
-    def __init__(self, path: Path, part_bytes: int = PART_BYTES) -> None:
+    def __init__(self, path: Path) -> None:
         self.paths: list[Path] = []
         self._path = path
-        self._part_bytes = part_bytes
         self._begin()
 
     def _begin(self) -> None:
@@ -132,13 +130,13 @@ class McapRecording:
         self._writer.add_message(channel, log_time=time_ns, data=data, publish_time=time_ns)
 
     def flush(self) -> None:
-        """Give complete chunks to the operating system; continue in a new file above `part_bytes`.
+        """Give complete chunks to the operating system; continue in a new file above `PART_BYTES`.
 
         Raises:
             OSError: The file cannot be written.
         """
         self._file.flush()
-        if self._file.tell() > self._part_bytes:
+        if self._file.tell() > PART_BYTES:
             self.close()
             self._begin()
 

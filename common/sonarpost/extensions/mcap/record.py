@@ -85,15 +85,10 @@ def add_replay(parser: CommandParser) -> None:
 
 
 class RecordQueue:
-    """Received samples that wait to be written, bounded in bytes. Zenoh's threads add, the main thread takes.
+    """Received samples that wait to be written, bounded in bytes. Zenoh's threads add, the main thread takes."""
 
-    Args:
-        max_bytes: Limit of the payloads.
-    """
-
-    def __init__(self, max_bytes: int = MAX_QUEUED_BYTES) -> None:
+    def __init__(self) -> None:
         self.dropped = 0
-        self._max_bytes = max_bytes
         self._bytes = 0
         self._samples: deque[RecordedMessage] = deque()
         self._changed = threading.Condition()
@@ -101,7 +96,7 @@ class RecordQueue:
     def add(self, message: "RecordedMessage") -> None:
         """Add a message, or drop and count it above the limit."""
         with self._changed:
-            if self._bytes + len(message.payload) > self._max_bytes:
+            if self._bytes + len(message.payload) > MAX_QUEUED_BYTES:
                 self.dropped += 1
                 return
             self._bytes += len(message.payload)

@@ -156,7 +156,6 @@ class CotService:
         files: HTTP interface of the TAK server; None sends events without images.
         clock: Monotonic clock, seconds.
         utc: UTC clock, seconds.
-        max_contacts: Above it the least recently changed contact of the vessel with the most is dropped.
     """
 
     def __init__(
@@ -166,13 +165,11 @@ class CotService:
         *,
         clock: Callable[[], float] = time.monotonic,
         utc: Callable[[], float] = time.time,
-        max_contacts: int = MAX_NAMES,
     ) -> None:
         self._sender = sender
         self._files = files
         self._clock = clock
         self._utc = utc
-        self._max_contacts = max_contacts
         self._markers: OrderedDict[str, _Marker] = OrderedDict()
         self._waiting: OrderedDict[str, bytes] = OrderedDict()
         self._turns = Turns()
@@ -200,7 +197,7 @@ class CotService:
                 uid = oldest_of_largest(self._waiting, self._vessel_of)
                 del self._waiting[uid]
                 log.warning("Image not uploaded: too many wait", extra=kv(contact=uid, limit=MAX_IMAGES))
-        if len(self._markers) > self._max_contacts:
+        if len(self._markers) > MAX_NAMES:  # the least recently changed contact of the vessel with the most is dropped
             dropped = oldest_of_largest(self._markers, self._vessel_of)
             del self._markers[dropped]
             self._waiting.pop(dropped, None)
