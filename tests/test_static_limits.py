@@ -25,7 +25,6 @@ THREADS = {
     "common/sonarpost/cli/run.py": "copies the output of a process",
     "common/sonarpost/cli/progress.py": "prints progress",
     "common/sonarpost/delivery/inbox.py": "guarded: accepts records",
-    "common/sonarpost/delivery/outbox.py": "guarded: starts senders",
     "common/sonarpost/delivery/queue_sender.py": "guarded: sends records",
     "common/sonarpost/monitoring/fleet.py": "guarded: queries the fleet",
     "common/sonarpost/network/http_client.py": "passes every exception to the thread that waits",
