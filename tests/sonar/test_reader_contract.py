@@ -12,6 +12,7 @@ from sonarpost.errors import SurveyFileError
 from sonarpost.sonar.geometry import Position, offset_between_m, offset_position
 from sonarpost.sonar.options import Mounting, SurveyOptions
 from sonarpost.sonar.readers import open_survey, read_survey, recording_parts
+from sonarpost.sonar.readers.humminbird import SAMPLE_SPACING_M
 from sonarpost.sonar.survey import Side
 
 STORED = dict.fromkeys(MAKERS, lambda path: path) | {
@@ -37,11 +38,16 @@ def test_samples_and_navigation_are_read(kind, small_survey, tmp_path):
                 np.testing.assert_allclose(stored, np.maximum(expected, 1), rtol=1e-3)
             else:
                 np.testing.assert_array_equal(stored, expected)
-            assert got.channel(side).slant_range_m > 0
+            # Humminbird records no range: 40 samples of its assumed spacing.
+            range_m = 40 * SAMPLE_SPACING_M if kind == "humminbird" else want.channel(side).slant_range_m
+            assert got.channel(side).slant_range_m == pytest.approx(range_m, abs=0.01)
         off_m = offset_between_m(Position(want.lat_deg, want.lon_deg), Position(got.lat_deg, got.lon_deg))
         assert np.hypot(*off_m) < 0.8  # Humminbird stores Mercator coordinates in whole metres
         assert got.heading_deg == pytest.approx(want.heading_deg, abs=0.05)
         assert got.speed_mps == pytest.approx(want.speed_mps, abs=0.05)
+        for name in ("altitude_m", "depth_m", "pitch_deg", "roll_deg"):
+            stored = None if kind in ("humminbird", "sl2", "sl3", "svlog") else getattr(want, name)
+            assert getattr(got, name) == pytest.approx(stored, abs=0.01), name
 
 
 def test_info_matches_pings_and_iteration_can_be_repeated(kind, small_survey, tmp_path):
