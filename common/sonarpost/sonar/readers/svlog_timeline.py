@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain, islice, pairwise
 from statistics import fmean, median
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.readers.joining import PingPart, joined
@@ -283,19 +283,8 @@ def _interpolate(pings: list[PingPart[_Values]], before: _Values, after: _Values
 
 
 def _ping(part: PingPart[_Values]) -> Ping:
-    values = part.head
-    return Ping(
-        number=max(part.number, 0),
-        time_utc_s=part.time_utc_s,
-        channels=part.channels,
-        lat_deg=values.get("lat_deg"),
-        lon_deg=values.get("lon_deg"),
-        heading_deg=values.get("heading_deg"),
-        speed_mps=values.get("speed_mps"),
-        course_deg=values.get("course_deg"),
-        pitch_deg=values.get("pitch_deg"),
-        roll_deg=values.get("roll_deg"),
-    )
+    values: dict[str, Any] = {name: value for name, value in part.head.items() if name != "fix_s"}
+    return Ping(max(part.number, 0), part.time_utc_s, part.channels, **values)
 
 
 def _difference(reference: list[Profile], own: list[Profile], shift_s: float, max_gap_s: float) -> int | None:

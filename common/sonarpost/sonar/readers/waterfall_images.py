@@ -23,7 +23,7 @@ import tomllib
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from typing_extensions import override
@@ -184,10 +184,10 @@ class WaterfallSource(FileSource):
             raise self._file.error(
                 f"ping {row}, slant_range_m", values["slant_range_m"], f"metres, above 0 to {MAX_SLANT_RANGE_M:.0f}"
             )
-        navigation = {name: self._plausible(row, name, values, notes) for name in NAVIGATION_LIMITS}
+        navigation: dict[str, Any] = {name: self._plausible(row, name, values, notes) for name in NAVIGATION_LIMITS}
         if navigation["heading_deg"] == 360.0:
             navigation["heading_deg"] = 0.0
-        position = self._position(row, values)
+        position, grid_m = self._place(row, values)
         channels = tuple(
             ChannelPing(side, image[row].copy(), slant_range_m, self._config.frequency_hz)
             for side, image in self._images.items()
@@ -199,13 +199,8 @@ class WaterfallSource(FileSource):
             channels=channels,
             lat_deg=position.lat_deg if position else None,
             lon_deg=position.lon_deg if position else None,
-            heading_deg=navigation["heading_deg"],
-            altitude_m=navigation["altitude_m"],
-            depth_m=navigation["depth_m"],
-            speed_mps=navigation["speed_mps"],
-            pitch_deg=navigation["pitch_deg"],
-            roll_deg=navigation["roll_deg"],
-            grid_m=self._coordinates(row, values),
+            grid_m=grid_m,
+            **navigation,
         )
 
     def _number(self, row: int, name: str, values: dict[str, str]) -> float | None:
@@ -230,20 +225,14 @@ class WaterfallSource(FileSource):
         notes.add(out_of_range(name), row)
         return None
 
-    def _coordinates(self, row: int, values: dict[str, str]) -> tuple[float, float] | None:
-        """Return easting and northing of a table in metres."""
-        if self._config.positions != "metres":
-            return None
-        north, east = (self._number(row, name, values) for name in _COORDINATES["metres"])
-        return None if north is None or east is None else grid_coordinates(east, north)
-
-    def _position(self, row: int, values: dict[str, str]) -> Position | None:
+    def _place(self, row: int, values: dict[str, str]) -> tuple[Position | None, tuple[float, float] | None]:
+        """Return the position in degrees, and easting and northing of a table in metres."""
         north, east = (self._number(row, name, values) for name in _COORDINATES[self._config.positions])
-        if north is None or east is None or (north, east) == (0.0, 0.0):
-            return None
-        if self._projection is not None:
-            return self._projection.position(east, north)
-        return position_in_degrees(north, east)
+        if north is None or east is None:
+            return None, None
+        if self._projection is None:
+            return position_in_degrees(north, east), None
+        return self._projection.position(east, north), grid_coordinates(east, north)
 
     def _time(self, row: int, text: str) -> float:
         try:
