@@ -263,10 +263,7 @@ class ConsoleState:
             stored = decisions.add_decision(db, contact_id, entered, actor, self.clock(), self._delivery_states())
         for user in stored.notified:
             self.events.publish("notice", {"user": user})
-        return {
-            "decision": self._record_json("decision", stored.decision_id),
-            "contact": self._contact_json(contact_id),
-        }
+        return self._decision_json(stored.decision_id, contact_id)
 
     def undo(self, contact_id: str, decision_id: str, displayed: DisplayedImage, actor: Actor) -> Json:
         """Store a record that withdraws an own decision; return it with its contact.
@@ -280,7 +277,10 @@ class ConsoleState:
             states = self._delivery_states()
             new_id = decisions.undo_decision(db, contact_id, decision_id, displayed, actor, self.clock(), states)
             objects.undo_rest(db, decision_id, actor, self.clock(), states)
-        return {"decision": self._record_json("decision", new_id), "contact": self._contact_json(contact_id)}
+        return self._decision_json(new_id, contact_id)
+
+    def _decision_json(self, decision_id: str, contact_id: str) -> Json:
+        return {"decision": self._record_json("decision", decision_id), "contact": self._contact_json(contact_id)}
 
     def _record_json(self, table: Table, record_id: str) -> Json:
         with self.database.read() as db:
@@ -338,7 +338,7 @@ class ConsoleState:
             row = decisions.last_own_decision(db, user, self.clock() - LAST_DECISION_S)
         if row is None:
             return {"decision": None, "contact": None}
-        return {"decision": RECORD_JSON["decision"](row), "contact": self._contact_json(row["contact_id"])}
+        return self._decision_json(row["decision_id"], row["contact_id"])
 
     def notices(self, user: str) -> list[Json]:
         """Return the open notices of a user about disputed and overruled decisions."""

@@ -39,7 +39,7 @@ def path(tmp_path):
 
 @pytest.fixture
 def heart(path, tmp_path):
-    return Heartbeat(path, tmp_path, 5.0)
+    return Heartbeat({heartbeat.VARIABLE: str(path)}, tmp_path, 5.0)
 
 
 def test_service_with_a_heartbeat_is_healthy(heart, path):
@@ -52,7 +52,7 @@ def test_service_with_a_heartbeat_is_healthy(heart, path):
 
 @pytest.mark.parametrize("interval_s", [5.0, 60.0])
 def test_old_heartbeat_means_a_hanging_process(path, tmp_path, interval_s):
-    Heartbeat(path, tmp_path, interval_s).beat(health(), NOW_S)
+    Heartbeat({heartbeat.VARIABLE: str(path)}, tmp_path, interval_s).beat(health(), NOW_S)
     age_s = 3 * interval_s
     assert health_problem(path, NOW_S + age_s) == ""
     assert health_problem(path, NOW_S + age_s + 0.1).startswith(f"hangs: last heartbeat {age_s:.0f} s ago")
@@ -94,7 +94,7 @@ def test_stall_limit_is_configurable(heart, path):
 
 
 def test_full_disk_and_missing_folder_are_reported_before_a_record_fails(heart, path, tmp_path, monkeypatch):
-    Heartbeat(path, tmp_path / "gone", 5.0).beat(health(), NOW_S)
+    Heartbeat({heartbeat.VARIABLE: str(path)}, tmp_path / "gone", 5.0).beat(health(), NOW_S)
     assert health_problem(path, NOW_S) == f"{tmp_path / 'gone'}: No such file or directory"
     heart.beat(health(), NOW_S)
     monkeypatch.setattr(healthcheck, "MIN_FREE_BYTES", 1 << 62)
@@ -117,7 +117,7 @@ def test_missing_variable_is_an_error():
 
 
 def test_unwritable_heartbeat_is_logged_once(tmp_path, caplog):
-    heart = Heartbeat(tmp_path / "no" / "heartbeat", tmp_path, 5.0)
+    heart = Heartbeat({heartbeat.VARIABLE: str(tmp_path / "no" / "heartbeat")}, tmp_path, 5.0)
     heart.beat(health(), NOW_S)
     heart.beat(health(), NOW_S + 5)
     assert [record.getMessage() for record in caplog.records] == ["Heartbeat not written"]

@@ -23,7 +23,7 @@ def manager_socket(tmp_path):
 
 
 def sender(tmp_path, interval_s=5.0, **variables):
-    return ServiceManager.from_environment({"NOTIFY_SOCKET": str(tmp_path / "notify"), **variables}, interval_s)
+    return ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "notify"), **variables}, interval_s)
 
 
 def received(bound):
@@ -62,7 +62,7 @@ def test_an_absent_manager_is_logged_once(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         manager.alive("ok")
         manager.alive("ok")
-        ServiceManager.from_environment({}, 5.0).alive("ok")
+        ServiceManager({}, 5.0).alive("ok")
     assert [record.message for record in caplog.records] == ["systemd not notified"]
 
 

@@ -60,7 +60,7 @@ class RouterMonitor:
         self._peers: dict[str, str] = {}
         self._denied: dict[str, str] = {}
         self._stop = threading.Event()
-        self._manager = ServiceManager.from_environment(os.environ, HEALTH_INTERVAL_S)
+        self._manager = ServiceManager(os.environ, HEALTH_INTERVAL_S)
         self._declared: list[object] = []
         self._thread: threading.Thread | None = None
 

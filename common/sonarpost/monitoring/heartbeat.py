@@ -28,24 +28,19 @@ class Heartbeat:
     """Writer of the heartbeat file.
 
     Args:
-        path: The file; None disables it.
+        environment: Variables of the process; without the file in `SONARPOST_HEARTBEAT` nothing is written.
         state_dir: Folder of the service's store, whose free space is checked.
         interval_s: Interval of the calls of `beat`.
     """
 
-    def __init__(self, path: Path | None, state_dir: Path, interval_s: float) -> None:
-        self._path = path
+    def __init__(self, environment: Mapping[str, str], state_dir: Path, interval_s: float) -> None:
+        name = environment.get(VARIABLE, "")
+        self._path = Path(name) if name else None
         self._state_dir = state_dir
         self._interval_s = interval_s
         self._finished = -1
         self._progress_s = 0.0
         self._warned = False
-
-    @classmethod
-    def from_environment(cls, environment: Mapping[str, str], state_dir: Path, interval_s: float) -> Heartbeat:
-        """Return a heartbeat with the file from the environment."""
-        name = environment.get(VARIABLE, "")
-        return cls(Path(name) if name else None, state_dir, interval_s)
 
     def beat(self, health: Health, now_s: float) -> None:
         """Write the present state.

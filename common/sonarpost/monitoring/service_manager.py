@@ -26,23 +26,17 @@ class ServiceManager:
     """Sender of messages to systemd.
 
     Args:
-        address: Path of systemd's socket, or `@` and the name of an abstract one; empty to send nothing.
-        watchdog_s: Time after which systemd ends a process without `alive`; 0 for never.
+        environment: Variables of the process: path of systemd's socket, or `@` and the name of an abstract one, without
+            which nothing is sent; time after which systemd ends a process without `alive`, by default never.
         interval_s: Interval of the calls of `alive`.
     """
 
-    def __init__(self, address: str, watchdog_s: float, interval_s: float) -> None:
+    def __init__(self, environment: Mapping[str, str], interval_s: float) -> None:
+        address, watchdog_us = environment.get(SOCKET_VARIABLE, ""), environment.get(WATCHDOG_VARIABLE, "")
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
-        self._watchdog_s = watchdog_s
+        self._watchdog_s = int(watchdog_us) / 1e6 if watchdog_us.isdecimal() else 0.0
         self._interval_s = interval_s
         self._warned = False
-
-    @classmethod
-    def from_environment(cls, environment: Mapping[str, str], interval_s: float) -> ServiceManager:
-        """Return a sender with the address and the watchdog time of the environment."""
-        watchdog_us = environment.get(WATCHDOG_VARIABLE, "")
-        watchdog_s = int(watchdog_us) / 1e6 if watchdog_us.isdecimal() else 0.0
-        return cls(environment.get(SOCKET_VARIABLE, ""), watchdog_s, interval_s)
 
     def ready(self, status: str) -> None:
         """Report that the process has started. A watchdog time that is too short for the interval is extended."""

@@ -68,8 +68,8 @@ class ServiceHealth:
         self._counters: Counter[str] = Counter()
         self._lock = threading.Lock()
         self._interval_logs: list[IntervalLog] = []
-        self._heartbeat = Heartbeat.from_environment(os.environ, platform.state_dir, platform.health_interval_s)
-        self.manager = ServiceManager.from_environment(os.environ, platform.health_interval_s)
+        self._heartbeat = Heartbeat(os.environ, platform.state_dir, platform.health_interval_s)
+        self.manager = ServiceManager(os.environ, platform.health_interval_s)
 
     def count(self, name: str, by: int = 1) -> None:
         """Increase a counter."""
