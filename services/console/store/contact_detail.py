@@ -101,14 +101,9 @@ def _image_lines(measurements: Iterable[Json]) -> tuple[ImageLine, ...]:
     """Return the measured lines to draw; withdrawn ones are excluded."""
     found = []
     for body in measurements:
-        start, end = body["from"], body["to"]
-        kind = str(body["kind"])
-        if body["withdrawn_utc_s"] is not None:
-            continue
-        assert isinstance(start, list)
-        assert isinstance(end, list)
-        text = f"{_LETTERS.get(kind, kind)} {body['value_m']:.2f} ± {body['sigma_m']:.2f} m"
-        found.append(ImageLine(kind, (start[0], start[1]), (end[0], end[1]), text))
+        if body["withdrawn_utc_s"] is None:
+            text = f"{_LETTERS[body['kind']]} {body['value_m']:.2f} ± {body['sigma_m']:.2f} m"
+            found.append(ImageLine(body["kind"], tuple(body["from"]), tuple(body["to"]), text))
     return tuple(found)
 
 
@@ -154,7 +149,7 @@ def withdraw_measurement(
         expected = f"a measurement of {contact_id} that is not withdrawn"
         raise NotFoundError("measurement", "id", measurement_id, expected)
     found = measurement_json(db.execute("SELECT * FROM measurement WHERE id = ?", (measurement_id,)).fetchone())
-    displayed = DisplayedImage(version=int(str(found["version"])), layer=str(found["layer"]))
+    displayed = DisplayedImage(version=found["version"], layer=found["layer"])
     detail = {name: found[name] for name in ("id", "kind", "value_m", "user", "utc_s")}
     add_audit_entry(db, contact_id, actor, "withdraw", now_utc_s, displayed, detail)
     return found

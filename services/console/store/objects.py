@@ -8,7 +8,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from itertools import product
 from statistics import fmean, stdev
-from typing import Any, Final
+from typing import Final
 
 from sonarpost.errors import BadInputError
 from sonarpost.messages import Contact
@@ -88,7 +88,7 @@ def _looks(db: sqlite3.Connection, object_id: str) -> list[Look]:
     return looks
 
 
-def _look_json(db: sqlite3.Connection, look: Look) -> dict[str, Any]:
+def _look_json(db: sqlite3.Connection, look: Look) -> Json:
     row = find_contact(db, look.contact_id)
     image = find_image(db, look.contact_id)
     record = image.contact

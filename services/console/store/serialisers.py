@@ -17,7 +17,7 @@ from sonarpost.review.image_geometry import contact_box, contact_mark, range_axi
 from sonarpost.review.resolution import CODEBOOK_CODECS, codebook_edge_px, sharp_to_m
 from sonarpost.services.console.store.database import NotFoundError, Table
 
-Json = dict[str, object]
+Json = dict[str, Any]
 Stage = Literal["record", "preview", "part", "sent", "refined"]
 
 MAX_VERSIONS: Final = limit(50, "versions", "claims", "contacts of the console", "vehicle", "shown", "the newest")
@@ -72,9 +72,9 @@ def _select(row: sqlite3.Row, columns: str, prefix: str = "") -> Json:
     return {name: row[prefix + name] for name in columns.split()}
 
 
-def newest_image(row: sqlite3.Row) -> dict[str, Any]:
+def newest_image(row: sqlite3.Row) -> Json:
     """Return the newest image version of a contact without pixels, with its contact record, as in a side-car."""
-    found: dict[str, Any] = json.loads(row["image"])
+    found: Json = json.loads(row["image"])
     return found
 
 

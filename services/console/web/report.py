@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import IO, Final
@@ -94,8 +94,6 @@ def _sheet(given: ReportContact, now_utc_s: float, *, training: bool) -> str:
     contact, detail = given.stored.contact, given.detail
     name = html.escape(contact.name)
     mark = "<p class='training'>TRAINING: simulated contact</p>" if training else ""
-    audit = detail["audit"]
-    assert isinstance(audit, list)
     return (
         f"<article class='sheet'><header><h1>Contact {name}</h1>"
         f"<p class='stamp {contact.review}'>{VERDICT_WORDS[contact.review]}</p>"
@@ -104,7 +102,7 @@ def _sheet(given: ReportContact, now_utc_s: float, *, training: bool) -> str:
         f"{_table('Measurements', detail['measurements'], _MEASUREMENT_COLUMNS)}"
         f"{_table('Decisions', detail['decisions'], _DECISION_COLUMNS)}"
         f"{_table('Comments', detail['comments'], _COMMENT_COLUMNS)}"
-        f"{_table('Audit, latest entries', audit[: -MAX_AUDIT_ROWS - 1 : -1], _AUDIT_COLUMNS)}"
+        f"{_table('Audit, latest entries', detail['audit'][: -MAX_AUDIT_ROWS - 1 : -1], _AUDIT_COLUMNS)}"
         f"<footer><p>{html.escape(_integrity_text(given))}</p></footer></article>"
     )
 
@@ -214,9 +212,8 @@ def _image_facts(given: ReportContact) -> list[Fact]:
 
 def _integrity_text(given: ReportContact) -> str:
     """Return what of the original the image contains."""
-    image, versions = given.stored.image, given.detail["versions"]
-    assert isinstance(versions, list)
-    version: Json = next((v for v in versions if v["version"] == image.version), {})
+    image = given.stored.image
+    version: Json = next((v for v in given.detail["versions"] if v["version"] == image.version), {})
     if not image.codec:
         return "No image was received, only the contact record."
     complete = "complete" if image.complete else "incomplete: more was announced than received"
@@ -286,9 +283,8 @@ _AUDIT_COLUMNS: Final = {
 }
 
 
-def _table(title: str, items: object, columns: Mapping[str, str]) -> str:
+def _table(title: str, items: Sequence[Json], columns: Mapping[str, str]) -> str:
     """Return a table with one row for each item; empty without items."""
-    assert isinstance(items, list)
     if not items:
         return ""
     head = "".join(f"<th>{column}</th>" for column in columns)
@@ -302,7 +298,7 @@ def _cell(item: Json, name: str) -> str:
         return f"<td>{_time_text(value)}</td>"
     if name == "verdict":
         # Records have no verdict for a withdrawal: theirs repeats the decision before.
-        value = "withdrawn" if item.get("undoes") else VERDICT_WORDS.get(value) if value else ""  # type: ignore[call-overload]
+        value = "withdrawn" if item.get("undoes") else VERDICT_WORDS.get(value) if value else ""
         value = f"{value} (taken back)" if item.get("undone") else value
     text = "" if value is None else f"{value:.2f}" if isinstance(value, float) else str(value)
     mark = " class='withdrawn'" if item.get("withdrawn_utc_s") or item.get("undone") else ""
@@ -332,12 +328,10 @@ class ReportRoutes:
         ]
 
     def _report(self, call: Call) -> Response:
-        detail = self._state.contact_detail(str(call.request.path_params["id"]))
-        contact = detail["contact"]
-        assert isinstance(contact, dict)
-        contact_id, version = str(contact["id"]), int(contact["version"])
+        contact_id = str(call.request.path_params["id"])
+        detail = self._state.contact_detail(contact_id)
         with self._state.database.read() as db:
-            stored = find_stored_contact(db, contact_id, version)
+            stored = find_stored_contact(db, contact_id, detail["contact"]["version"])
         name = stored.contact.name
         text = "".join(self._parts([ReportContact(detail, stored)], f"Contact {name}"))
         return Response(text, headers=_headers(name.replace("/", "-")))
