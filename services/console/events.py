@@ -31,10 +31,9 @@ class EventHub:
     Events are numbered within one run. A page with an event identifier of another run reloads all data.
     """
 
-    def __init__(self, buffered: int = BUFFERED_EVENTS) -> None:
+    def __init__(self) -> None:
         self.run = uuid.uuid4().hex[:8]
         self._lock = threading.Lock()
-        self._buffered = buffered
         self._events: deque[PageEvent] = deque()
         self._bytes = 0
         self._last = 0
@@ -47,7 +46,7 @@ class EventHub:
             self._last += 1
             self._events.append(PageEvent(self._last, name, text))
             self._bytes += len(text)
-            while len(self._events) > self._buffered or (self._bytes > MAX_BUFFERED_BYTES and len(self._events) > 1):
+            while len(self._events) > BUFFERED_EVENTS or (self._bytes > MAX_BUFFERED_BYTES and len(self._events) > 1):
                 self._bytes -= len(self._events.popleft().data)
         self.notify_all()
 

@@ -301,14 +301,14 @@ class ConsoleState:
         """
         with self.database.transaction() as db:
             stored = objects.decide_object(db, object_id, entered, actor, self.clock(), self._delivery_states())
-        for user in sorted({user for _, one in stored for user in one.notified}):
+        for user in sorted({user for one in stored for user in one.notified}):
             self.events.publish("notice", {"user": user})
         with self.database.read() as db:
             # A sealed contact is not listed after its decision.
             remaining = (
                 objects.object_json(db, object_id, self.rule) if association.looks_of_object(db, object_id) else None
             )
-        made = [self._record_json("decision", one.decision_id) for _, one in stored]
+        made = [self._record_json("decision", one.decision_id) for one in stored]
         return {"decisions": made, "object": remaining}
 
     def split_look(self, object_id: str, contact_id: str, actor: Actor) -> Json:

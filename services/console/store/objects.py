@@ -173,8 +173,8 @@ def decide_object(
     actor: Actor,
     now_utc_s: float,
     delivery: DeliveryStates,
-) -> list[tuple[str, StoredDecision]]:
-    """Store one verdict as a decision on each of several looks; return contact and decision of each.
+) -> list[StoredDecision]:
+    """Store one verdict as a decision on each of several looks; return the decisions.
 
     The decisions have a common `batch`, so that one undo withdraws all of them.
 
@@ -191,13 +191,13 @@ def decide_object(
         BadInputError: A contact is not a look of the object, or a displayed image is not a version of its contact.
     """
     known = {look.contact_id for look in _looks(db, object_id)}
-    stored: list[tuple[str, StoredDecision]] = []
+    stored: list[StoredDecision] = []
     for contact_id, decision in entered.items():
         if contact_id not in known:
             raise BadInputError("decision", "looks", contact_id, f"a look of object {object_id}")
-        stored.append((contact_id, add_decision(db, contact_id, decision, actor, now_utc_s, delivery)))
+        stored.append(add_decision(db, contact_id, decision, actor, now_utc_s, delivery))
     batch = f"b-{uuid.uuid4().hex}"
-    db.executemany("UPDATE decision SET batch = ? WHERE decision_id = ?", [(batch, s.decision_id) for _, s in stored])
+    db.executemany("UPDATE decision SET batch = ? WHERE decision_id = ?", [(batch, one.decision_id) for one in stored])
     return stored
 
 

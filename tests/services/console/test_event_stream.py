@@ -110,8 +110,9 @@ def test_large_events_do_not_fill_the_memory():
     assert hub.events_after(20) is None
 
 
-def test_event_buffer():
-    hub = EventHub(buffered=3)
+def test_event_buffer(monkeypatch):
+    monkeypatch.setattr("sonarpost.services.console.events.BUFFERED_EVENTS", 3)
+    hub = EventHub()
     notified = []
     notify = lambda: notified.append(1)  # noqa: E731
     hub.subscribe(notify)
