@@ -6,7 +6,6 @@ feedback, and the air time until all images are complete with feedback: for each
 """
 
 import argparse
-import json
 import sys
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -209,7 +208,6 @@ def new_parser() -> argparse.ArgumentParser:
         "--delay-frames", type=int, default=default.delay_frames, metavar="N", help="delay of the second vessel (20)"
     )
     parser.add_argument("--seeds", type=int, default=20, metavar="N", help="number of seeds, 1..1000 (20)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
     return parser
 
 
@@ -226,12 +224,8 @@ def run(args: argparse.Namespace) -> int:
     for seed in range(args.seeds):
         report_progress(f"seed {seed + 1} of {args.seeds}")
         results.append(measure(spec, seed))
-    rows = {way: summary(results, way) for way in WAYS}
-    if args.json:
-        print(json.dumps({"seeds": args.seeds, "results": rows}, allow_nan=False))
-    else:
-        print(f"{args.seeds} seeds, {spec.images} images, {spec.loss:.0%} independent loss to each vessel")
-        print(table(rows))
+    print(f"{args.seeds} seeds, {spec.images} images, {spec.loss:.0%} independent loss to each vessel")
+    print(table({way: summary(results, way) for way in WAYS}))
     return 0
 
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -86,7 +85,6 @@ def new_parser() -> argparse.ArgumentParser:
         help="images a range, size and rate (default: %(default)s)",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of images and channel (default: 0)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
     parser.add_argument("--plot", type=Path, metavar="FILE.png", help="draw the result (needs matplotlib)")
     return parser
 
@@ -110,11 +108,7 @@ def run(args: argparse.Namespace) -> int:
     cells = measure(args.images, args.seed, RANGES_M, SIZES_PX)
     if args.plot is not None:
         save_figure(plot(cells), args.plot)
-    if args.json:
-        results = [_row(cell) for cell in cells]
-        print(json.dumps({"water": _PRESET, "seed": args.seed, "results": results, "claims": claims(cells)}))
-    else:
-        print(table(cells))
+    print(table(cells))
     return 0
 
 
@@ -192,11 +186,6 @@ def claims(cells: Sequence[Cell]) -> list[dict[str, str | float | bool]]:
 
 def _share(counts: Sequence[tuple[int, int]]) -> float:
     return sum(count for count, _ in counts) / sum(total for _, total in counts)
-
-
-def _row(cell: Cell) -> dict[str, int | float]:
-    setting = {"rate": cell.rate, "width_px": cell.width_px, "height_px": cell.height_px, "range_m": cell.range_m}
-    return setting | asdict(cell.delivered)
 
 
 def table(cells: Sequence[Cell]) -> str:

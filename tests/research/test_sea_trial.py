@@ -1,6 +1,5 @@
 """`python -m research.sea_trial`: counts of the rig, claims, and the command."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -71,16 +70,13 @@ def test_command_prints_and_plots(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(sea_trial, "RANGES_M", (60, 130, 200))
     monkeypatch.setattr(sea_trial, "SIZES_PX", SIZES_PX[1:2])
     path = tmp_path / "plot.png"
-    assert sea_trial.main(["--images", "3", "--json", "--plot", str(path)]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert (printed["water"], printed["seed"]) == ("sea-trial", 0)
-    found = [(row["rate"], row["width_px"], row["range_m"]) for row in printed["results"]]
-    assert found == [(rate, 80, range_m) for rate in (1, 4) for range_m in (60, 130, 200)]
-    assert all(row["images"] == 3 and row["packets"] == 6 for row in printed["results"])
+    assert sea_trial.main(["--images", "3", "--plot", str(path)]) == 0
+    assert capsys.readouterr().out.count("| 130 | ") == 2
+    cells = measure(3, 0, (60, 130, 200), SIZES_PX[1:2])
+    assert [(c.rate, c.width_px, c.range_m) for c in cells] == [(r, 80, m) for r in (1, 4) for m in (60, 130, 200)]
+    assert all((cell.delivered.images, cell.delivered.packets) == (3, 6) for cell in cells)
     with Image.open(path) as image:
         assert image.size[0] > 1000
-    assert sea_trial.main(["--images", "2"]) == 0
-    assert "| 130 | " in capsys.readouterr().out
 
 
 def test_delivery_table_has_every_rate_and_range() -> None:

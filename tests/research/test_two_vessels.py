@@ -1,7 +1,5 @@
 """Two vessels that receive one vehicle: merged frames make images complete, with less air time."""
 
-import json
-
 import pytest
 
 from research import two_vessels
@@ -25,10 +23,8 @@ def test_delay_of_the_second_vessel_changes_no_image() -> None:
 
 
 def test_command_prints_each_way_and_values_out_of_range_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert two_vessels.main(["--seeds", "1", "--images", "4", "--json"]) == 0
-    assert tuple(json.loads(capsys.readouterr().out)["results"]) == WAYS
     assert two_vessels.main(["--seeds", "1", "--images", "4"]) == 0
-    assert "merged" in capsys.readouterr().out
+    assert tuple(line.split()[0] for line in capsys.readouterr().out.splitlines()[-3:]) == WAYS
     for options in ({"loss": 0.95}, {"images": 0}, {"delay_frames": -1}):
         with pytest.raises(ConfigError):
             TwoVesselsSpec(**options)  # type: ignore[arg-type]
