@@ -11,13 +11,14 @@ from rich.console import Console
 
 from research.codebook.adaptation import CodebookQuality, adapt, measure, split_images
 from research.codebook.builder import MAX_TILES, Round, TrainingImage, build, rms_distance
+from research.codebook.codebook_file import save
 from research.codebook.comparison import UnmatchedTiles, compare
 from sonarpost.cli.main import apply_verbosity, exit_status
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay
 from sonarpost.cli.shared import in_new_folder
 from sonarpost.codec.interface import Image, to_uint8
-from sonarpost.codec.vq.codebook import Codebook, open_codebook, save
+from sonarpost.codec.vq.codebook import Codebook, open_codebook
 from sonarpost.codec.vq.codec import codebook_tag
 from sonarpost.codec.vq.tiles import MAX_DIMS
 from sonarpost.errors import CodebookError, ConfigError, SurveyFileError

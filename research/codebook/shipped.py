@@ -22,10 +22,11 @@ import numpy.typing as npt
 from rich.console import Console
 
 from research.codebook.builder import ProgressCallback, Round, TrainingImage, build, rms_distance
+from research.codebook.codebook_file import save
 from research.common.command import command_parser, run_command
 from research.common.patches import PatchPlan, SonarLine, cut_around, cut_line, shuffled
 from sonarpost.cli.progress import ProgressDisplay
-from sonarpost.codec.vq.codebook import Codebook, load, save
+from sonarpost.codec.vq.codebook import Codebook, load
 from sonarpost.errors import CodebookError, ConfigError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind

@@ -14,6 +14,7 @@ from itertools import islice
 import numpy as np
 
 from builders.modem_fuzz import steps
+from builders.v1_world import add_message
 from sonarpost.link.config import ReceiverConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
@@ -54,7 +55,7 @@ def genuine(seed: int) -> Iterator[bytes]:
             number = number % 5000 + 1
             sender.add_image(number, record(number), image_stream(number), 0.0)
             if rng.random() < 0.3:
-                sender.add_message(MESSAGE + bytes([number % 256]) * int(rng.integers(1, 150)), 0.0)
+                add_message(sender, MESSAGE + bytes([number % 256]) * int(rng.integers(1, 150)), 0.0)
         while (frame := sender.next_frame(0.0)) is not None:
             yield frame
 

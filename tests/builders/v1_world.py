@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sonarpost.link.auth.authentication import FrameAuthenticator
+from sonarpost.link.coding.redundancy_plan import copies
 from sonarpost.link.config import QueueConfig, ReceiverConfig, SenderConfig
 from sonarpost.link.downlink.messages import number_of_image
 from sonarpost.link.frames.contact_record import ContactSummary
@@ -49,6 +50,20 @@ def next_frames(sender: V1Sender, count: int, now: float) -> tuple[bytes, ...]:
 def feedback_frame(feedback: Feedback, protection: FrameAuthenticator | None = None) -> bytes:
     """Return the frame of 32 bytes that carries a feedback."""
     return pack_segments([Segment(SegmentKind.FEEDBACK, feedback.pack())], 32, protection)
+
+
+def add_message(
+    sender: V1Sender,
+    data: bytes,
+    now: float,
+    *,
+    priority: int = 0,
+    lifetime_s: float = 3600.0,
+    times: int | None = None,
+) -> int:
+    """Add a message, with as many copies as the loss needs by default; return its number."""
+    times = copies(sender.config.worst) if times is None else times
+    return sender.state.messages.add(data, priority, now + lifetime_s, times)
 
 
 @dataclass

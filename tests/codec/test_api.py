@@ -10,7 +10,8 @@ from builders.images import snippet
 
 import sonarpost.codec as c
 from research.codebook.basis import database_of
-from sonarpost.codec.vq.codebook import Codebook, save
+from research.codebook.codebook_file import save
+from sonarpost.codec.vq.codebook import Codebook
 from sonarpost.codec.vq.tiles import cut_tiles
 from sonarpost.errors import CodebookError, ConfigError, StreamError
 

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from research.codebook.basis import database_of
+from research.codebook.codebook_file import save
 from research.codecs import __main__ as command
 from research.codecs.baselines import comparison_registry
 from research.common import measurement as measuring
@@ -18,7 +19,7 @@ from research.common.measurement import CodecUnderTest, code_image, measure_code
 from research.common.quality import psnr_db
 from research.common.scene_measures import PSNR_LIMIT_DB
 from sonarpost.codec.interface import DecodedImage, StreamHeader
-from sonarpost.codec.vq.codebook import Codebook, save
+from sonarpost.codec.vq.codebook import Codebook
 from sonarpost.errors import CodebookError, StreamError
 from sonarpost.sonar.image_files import write_png, write_tiff
 

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from research.codebook.basis import database_of
+from research.codebook.codebook_file import save
 from sonarpost.codec.vq.codebook import (
     DEFAULT_TILE_PX,
     Codebook,
@@ -19,7 +20,6 @@ from sonarpost.codec.vq.codebook import (
     load,
     load_default,
     open_codebook,
-    save,
     to_bytes,
 )
 from sonarpost.codec.vq.codec import VqCodec, codebook_tag

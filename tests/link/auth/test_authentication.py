@@ -7,7 +7,7 @@ import re
 import pytest
 from builders.authentication_world import VEHICLE, VESSEL, key, vehicle_authenticator, vessel_authenticator
 from builders.link_state import group, with_fields
-from builders.v1_world import contact, feedback_frame, stream
+from builders.v1_world import add_message, contact, feedback_frame, stream
 
 from sonarpost.errors import ConfigError, FrameError
 from sonarpost.link.auth.authentication import (
@@ -255,7 +255,7 @@ def test_images_and_feedback_with_authentication(frame_bytes: int, settings: Aut
     images = {number: stream(number, 200) for number in range(1, 5)}
     for number, data in images.items():
         vehicle.add_image(number, contact(number), data, 0.0)
-    vehicle.add_message(b"status", 0.0)
+    add_message(vehicle, b"status", 0.0)
     received: dict[int, bytes] = {}
     now, channel = 0.0, random.Random(1)
     while not vehicle.is_idle and now < 20_000:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders.link_state import with_fields
-from builders.v1_world import next_frames
+from builders.v1_world import add_message, next_frames
 
 from sonarpost.errors import FrameError
 from sonarpost.link.coding.channel_capacity import LossChannel
@@ -47,7 +47,7 @@ class Vehicle:
                 if content not in self.accepted:
                     self.accepted.append(content)
                 answer = dl.ConfirmationMessage(((content.token, dl.CommandOutcome.ACCEPTED),))
-                self.sender.add_message(dl.pack(answer), now, times=1)
+                add_message(self.sender, dl.pack(answer), now, times=1)
 
 
 def restarted(link):
@@ -294,7 +294,7 @@ def test_overheard_vehicle_gets_no_feedback_and_its_messages_are_ignored():
 def test_messages_are_returned_once_and_invalid_ones_rejected():
     link = VesselEndpoint(CommandTracker(30.0))
     sender = V1Sender(SenderConfig(channels=(LossChannel(0.3),)))
-    sender.add_message(dl.pack(dl.DataMessage(b"status"), 4096), 0.0, times=2)
+    add_message(sender, dl.pack(dl.DataMessage(b"status"), 4096), 0.0, times=2)
     frames = [sender.next_frame(float(n)) for n in range(2)]
     received = [link.accept(UUV, frame, 0.0) for frame in frames if frame is not None]
     assert [each.messages for each in received] in ([(b"status",)], [(b"status",), ()])

@@ -14,13 +14,14 @@ from builders.common import eventually
 from builders.vessel_frames import CONTACT
 from PIL import Image
 
+from research.codebook.codebook_file import save
 from sonarpost import keys
 from sonarpost.archive.decoder import Decoder
 from sonarpost.archive.image_files import image_file_name
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.interface import StreamHeader
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq.codebook import Codebook, open_codebook, save
+from sonarpost.codec.vq.codebook import Codebook, open_codebook
 from sonarpost.codec.vq.codec import codebook_tag
 from sonarpost.codec.vq.tiles import TileDatabase
 from sonarpost.errors import CodebookError

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from builders.common import eventually
 from builders.records import decision_record
-from builders.v1_world import next_frames
+from builders.v1_world import add_message, next_frames
 from builders.vessel_frames import CONTACT, packet
 from pydantic import ValidationError
 
@@ -103,7 +103,7 @@ class Vehicle:
         if len(self.commands) > self.silent and len(tokens) >= self.together:
             for token in sorted(tokens) if first else [command.token]:
                 answer = dl.ConfirmationMessage(((token, dl.CommandOutcome.ACCEPTED),))
-                self.sender.add_message(dl.pack(answer), time.time(), times=1)
+                add_message(self.sender, dl.pack(answer), time.time(), times=1)
             self.send()
 
     def send(self):

@@ -6,6 +6,7 @@ from operator import itemgetter
 import pytest
 from builders.common import eventually
 from builders.records import encoded_image
+from builders.v1_world import add_message
 
 from sonarpost import keys, wire
 from sonarpost.errors import RetryLaterError
@@ -102,7 +103,7 @@ def test_commands_received_while_the_store_fails_are_executed_once_and_too_many_
     with unwritable(service):
         for token in (1, 2, 1, 3, 4):
             sender = V1Sender(SenderConfig(frame_bytes=32))
-            sender.add_message(pack(ResendMessage(token, 1000, 7)), 0.0, times=1)
+            add_message(sender, pack(ResendMessage(token, 1000, 7)), 0.0, times=1)
             service.on_modem_event(FrameReceived(1, 3, False, 1, sender.next_frame(0.0), 0.0, 0, None))
         eventually(lambda: service.health().counters.get("frames_dropped") == 2)
         eventually(lambda: "readonly database" in service.health().detail)

@@ -9,7 +9,7 @@ import msgpack
 import pytest
 from builders.common import eventually
 from builders.records import encoded_image, outgoing_message
-from builders.v1_world import feedback_frame
+from builders.v1_world import add_message, feedback_frame
 
 from sonarpost import keys, wire
 from sonarpost.codec.region import RegionBox
@@ -64,7 +64,7 @@ class Vessel:
 
         def send():
             for content in contents:
-                self.sender.add_message(dl.pack(content), 0.0, times=1)
+                add_message(self.sender, dl.pack(content), 0.0, times=1)
             while frame := self.sender.next_frame(0.0):
                 self.send(frame)
 
@@ -287,7 +287,7 @@ def test_with_a_key_only_authentic_frames_are_accepted_and_no_counter_is_used_tw
     authenticator = FrameAuthenticator(key, 1, Direction.TO_VEHICLE)
     authenticator.grant(authenticator.requested_limit)
     sender = V1Sender(SenderConfig(frame_bytes=32), protection=authenticator)
-    sender.add_message(dl.pack(dl.ResendMessage(1, 1000, 3)), 0.0, times=1)
+    add_message(sender, dl.pack(dl.ResendMessage(1, 1000, 3)), 0.0, times=1)
     frame = sender.next_frame(0.0)
     counters = lambda: service.health().counters  # noqa: E731
     repeat(lambda: vessel.send(frame), lambda: counters().get("commands_received") == 1)

@@ -22,7 +22,7 @@ import numpy as np
 from sonarpost.codec.vq.codec import codebook_tag
 from sonarpost.codec.vq.tiles import MAX_DIMS, MAX_TILE_PX, MIN_TILE_PX, TileDatabase
 from sonarpost.errors import CodebookError
-from sonarpost.files import read_regular, write_atomically
+from sonarpost.files import read_regular
 
 MAGIC = b"SPTILES\n"
 VERSION = 1
@@ -111,18 +111,6 @@ def _parse_notes(data: bytes, where: str) -> dict[str, str]:
     if not isinstance(notes, dict) or not all(isinstance(value, str) for value in notes.values()):
         raise CodebookError(where, "notes", notes, expected)
     return notes
-
-
-def save(path: Path, codebook: Codebook) -> None:
-    """Write a codebook file atomically.
-
-    Raises:
-        CodebookError: The file cannot be written.
-    """
-    try:
-        write_atomically(path, to_bytes(codebook))
-    except OSError as error:
-        raise CodebookError(str(path), "", str(error), "a writable file") from error
 
 
 def load(path: Path) -> Codebook:

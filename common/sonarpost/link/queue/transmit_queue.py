@@ -299,13 +299,12 @@ class TransmitQueue(ImageSender):
         while loaded < room and (message := self.messages.next(now, self.config.aging_s)) is not None:
             level = message.level(now, self.config.aging_s)
             self.messages.remove(message)
-            self.sender.add_message(
+            self.sender.state.messages.add(
                 message.data,
-                now,
-                priority=-level if level >= FILLER_PRIORITY else FILLER_PRIORITY - level,
-                lifetime_s=message.expires_s - now,
-                times=copies(worst, _MISSED / 10 if message.priority <= _URGENT else _MISSED),
-                rises_s=message.added_s + (message.priority - FILLER_PRIORITY + 1) * self.config.aging_s,
+                -level if level >= FILLER_PRIORITY else FILLER_PRIORITY - level,
+                message.expires_s,
+                copies(worst, _MISSED / 10 if message.priority <= _URGENT else _MISSED),
+                message.added_s + (message.priority - FILLER_PRIORITY + 1) * self.config.aging_s,
                 once=message.once,
             )
             loaded += len(message.data)

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from builders.link_state import group, with_fields
-from builders.v1_world import VEHICLE, World, contact, stream
+from builders.v1_world import VEHICLE, World, add_message, contact, stream
 
 from sonarpost.errors import ConfigError, FrameError, StreamError
 from sonarpost.link.coding.blocks import OutgoingImage, SendBlock
@@ -111,9 +111,9 @@ def test_messages_arrive_once() -> None:
     world.add(4, 300)
     small = [b"status %d" % n for n in range(8)]
     for data in small:
-        world.sender.add_message(data, 0.0)
+        add_message(world.sender, data, 0.0)
     long = stream(99, 900)
-    world.sender.add_message(long, 0.0)
+    add_message(world.sender, long, 0.0)
     world.run()
     assert sorted(world.messages) == sorted([*small, long])
 
@@ -122,7 +122,7 @@ def test_messages_and_contacts_share_a_frame() -> None:
     sender = V1Sender(SenderConfig(frame_bytes=128, group_delay_s=100.0))
     sender.add_image(1, contact(1), stream(1, 300), 0.0)
     for data in (b"one", b"two"):
-        sender.add_message(data, 0.0, times=1)
+        add_message(sender, data, 0.0, times=1)
     frame = sender.next_frame(0.0)
     assert frame is not None
     listed = parse_frame(frame)
@@ -136,9 +136,9 @@ def test_messages_and_contacts_share_a_frame() -> None:
 def test_message_priorities_and_lifetimes() -> None:
     sender = V1Sender(SenderConfig())
     sender.add_image(1, contact(1), stream(1, 300), 0.0)
-    sender.add_message(b"late", 0.0, priority=-1, times=1)
-    sender.add_message(b"expired", 0.0, lifetime_s=1.0)
-    sender.add_message(b"stop!", 0.0, priority=9, times=1)
+    add_message(sender, b"late", 0.0, priority=-1, times=1)
+    add_message(sender, b"expired", 0.0, lifetime_s=1.0)
+    add_message(sender, b"stop!", 0.0, priority=9, times=1)
     frames = []
     while (frame := sender.next_frame(5.0)) is not None:
         frames.append(parse_frame(frame))
@@ -151,7 +151,7 @@ def test_copies_of_a_message_keep_a_distance() -> None:
     sender = V1Sender(SenderConfig(channels=(LossChannel(0.3, 3.0),)))
     for number in range(1, 11):
         sender.add_image(number, contact(number), stream(number, 600), 0.0)
-    sender.add_message(b"go", 0.0)
+    add_message(sender, b"go", 0.0)
     places = [n for n in range(60) if (f := sender.next_frame(0.0)) and isinstance(parse_frame(f), tuple)]
     assert len(places) == 4
     assert min(b - a for a, b in pairwise(places)) > 12
@@ -280,7 +280,7 @@ def test_invalid_images_messages_and_configurations_are_rejected() -> None:
         sender.add_image(2, contact(1), b"", 0.0)
     for data in (b"", bytes(4097)):
         with pytest.raises(FrameError, match="message"):
-            sender.add_message(data, 0.0)
+            add_message(sender, data, 0.0)
     for wrong in ({"frame_bytes": 31}, {"channels": ()}, {"depth": 9}, {"max_defer_s": float("nan")}):
         with pytest.raises(ConfigError):
             SenderConfig(**wrong)  # type: ignore[arg-type]

@@ -5,7 +5,7 @@ from itertools import product
 
 import pytest
 from builders.authentication_world import VEHICLE, vehicle_authenticator, vessel_authenticator
-from builders.v1_world import contact, stream
+from builders.v1_world import add_message, contact, stream
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -45,7 +45,7 @@ def sent_frames(first_block: int, feedback: bool) -> list[bytes]:
     )
     for number in range(1, IMAGES + 1):
         sender.add_image(number, contact(number), stream(number, 250), 0.0)
-    sender.add_message(b"a message", 0.0, times=2)
+    add_message(sender, b"a message", 0.0, times=2)
     frames = [frame for _ in range(2 * WINDOW) if (frame := sender.next_frame(0.0)) is not None]
     assert IMAGES * 3 < len(frames) < WINDOW
     return frames

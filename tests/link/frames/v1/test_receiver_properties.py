@@ -4,7 +4,7 @@ import msgpack
 import pytest
 from builders import v1_fuzz
 from builders.link_state import comparable, plain_of, replace_a_value, with_fields
-from builders.v1_world import VEHICLE, contact, stream
+from builders.v1_world import VEHICLE, add_message, contact, stream
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -34,7 +34,7 @@ def deliveries(draw: st.DrawFn) -> list[tuple[float, bytes]]:
     for number in range(1, draw(st.integers(1, 9)) + 1):
         sender.add_image(number, contact(number), stream(number, draw(st.sampled_from([5, 40, 250]))), 0.0)
     if draw(st.booleans()):
-        sender.add_message(b"a message", 0.0, times=1)
+        add_message(sender, b"a message", 0.0, times=1)
     frames: list[bytes] = []
     while (frame := sender.next_frame(0.0)) is not None:
         frames.append(frame)
@@ -97,7 +97,7 @@ def busy_receiver() -> tuple[V1Sender, V1Receiver]:
     sender, receiver = V1Sender(SenderConfig(channels=(LossChannel(0.05), LossChannel(0.6)))), V1Receiver()
     for number in (1, 2, 3):
         sender.add_image(number, contact(number), stream(number, 300), 0.0)
-    sender.add_message(b"a message", 0.0)
+    add_message(sender, b"a message", 0.0)
     for _ in range(12):
         receiver.accept(VEHICLE, sender.next_frame(0.0) or b"", 0.0)
     return sender, receiver

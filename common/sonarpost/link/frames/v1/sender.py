@@ -20,7 +20,7 @@ from sonarpost.link.coding.delivery_ledger import (
     missing_images,
     record_delivered,
 )
-from sonarpost.link.coding.redundancy_plan import copies, symbols_to_send, usual_curve
+from sonarpost.link.coding.redundancy_plan import symbols_to_send, usual_curve
 from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.frame import (
@@ -168,34 +168,6 @@ class V1Sender:
             }
             for number in deletion_order(self.kept, self.config, needed)[:excess]:
                 del self.kept[number]
-
-    def add_message(
-        self,
-        data: bytes,
-        now: float,
-        *,
-        priority: int = 0,
-        lifetime_s: float = 3600.0,
-        times: int | None = None,
-        rises_s: float | None = None,
-        once: bool = False,
-    ) -> int:
-        """Add a message; return its number.
-
-        Args:
-            data: 1..4096 bytes. A message that is longer than a frame becomes a block of its own.
-            now: Seconds.
-            priority: See `MessageCopies`.
-            lifetime_s: Time after which it is not sent any more.
-            times: Number of copies; by default computed from the measured loss.
-            rises_s: See `MessageCopies`.
-            once: Whether it is sent once only.
-
-        Raises:
-            FrameError: Empty or too long.
-        """
-        times = copies(self.config.worst) if times is None else max(1, times)
-        return self.state.messages.add(data, priority, float(now + lifetime_s), times, rises_s, once=once)
 
     def plan_for(self, channels: tuple[LossChannel, ...]) -> None:
         """Use another measured loss for future plans; existing plans stay."""
