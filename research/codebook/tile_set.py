@@ -4,12 +4,12 @@ import numpy as np
 import numpy.typing as npt
 
 from sonarpost.codec.vq.tile_search import (
-    BLOCK_TILES,
+    GROUP,
     Distances,
     Indices,
     NearestSearch,
-    empty_blocks,
-    fill_blocks,
+    empty_columns,
+    fill_columns,
     squared_norms,
 )
 from sonarpost.codec.vq.tiles import Tiles
@@ -18,6 +18,7 @@ _CENTRE = 128
 _QUERY_ROWS = 256
 _CHUNK_TILES = 256
 _POOL_TILES = 4096
+_FIRST_TILES = 2048
 
 
 class IncrementalTileSet:
@@ -33,11 +34,10 @@ class IncrementalTileSet:
         self.tile_px = tile_px
         self.capacity = capacity
         self._count = 0
-        allocated = min(capacity, BLOCK_TILES)
+        allocated = min(capacity, _FIRST_TILES)
         self._vectors = np.zeros((allocated, tile_px * tile_px), dtype=np.int8)
         self._norms = np.zeros(allocated)
-        self._keys = np.zeros(allocated)
-        self._blocks = empty_blocks(1, tile_px * tile_px)
+        self._columns = empty_columns(allocated, tile_px * tile_px)
 
     def __len__(self) -> int:
         return self._count
@@ -62,22 +62,20 @@ class IncrementalTileSet:
         part = slice(self._count, end)
         self._vectors[part] = _centred(tiles)
         self._norms[part] = squared_norms(self._vectors[part])
-        self._keys[part] = _diagonal_coordinate(tiles, self.tile_px)
-        fill_blocks(self._blocks, self._count, self._vectors[part], self._norms[part])
+        fill_columns(self._columns, self._count, self._vectors[part], self._norms[part])
         self._count = end
 
     def nearest(self, tiles: Tiles) -> tuple[Indices, Distances]:
         """Return number and squared distance of the nearest stored tile (the lowest of equals) for each of `tiles`."""
         used = slice(self._count)
-        blocks = self._blocks[: -(-self._count // BLOCK_TILES)]
-        order = np.arange(self._count)
-        search = NearestSearch(blocks, order, self._vectors[used], self._norms[used], self._keys[used])
+        columns = self._columns[:, : -(-self._count // GROUP) * GROUP]
+        search = NearestSearch(columns, self._vectors[used], self._norms[used])
         index = np.empty(tiles.shape[0], dtype=np.int64)
         squared = np.empty(tiles.shape[0])
         for start in range(0, tiles.shape[0], _QUERY_ROWS):
             part = slice(start, start + _QUERY_ROWS)
             queries = _centred(tiles[part]).astype(np.float64)
-            found, distances = search.nearest(queries, _diagonal_coordinate(tiles[part], self.tile_px), 1)
+            found, distances = search.nearest(queries, 1)
             index[part], squared[part] = found[:, 0], distances[:, 0]
         return index, squared
 
@@ -117,14 +115,14 @@ class IncrementalTileSet:
         if count <= allocated:
             return
         allocated = min(max(count, 2 * allocated), max(self.capacity, count))
-        for name in ("_vectors", "_norms", "_keys"):
+        for name in ("_vectors", "_norms"):
             old = getattr(self, name)
             larger = np.zeros((allocated, *old.shape[1:]), dtype=old.dtype)
             larger[: self._count] = old[: self._count]
             setattr(self, name, larger)
-        blocks = empty_blocks(-(-allocated // BLOCK_TILES), self._vectors.shape[1])
-        blocks[: self._blocks.shape[0]] = self._blocks
-        self._blocks = blocks
+        columns = empty_columns(allocated, self._vectors.shape[1])
+        columns[:, : self._columns.shape[1]] = self._columns
+        self._columns = columns
 
 
 def _centred(tiles: Tiles) -> npt.NDArray[np.int8]:
@@ -133,11 +131,6 @@ def _centred(tiles: Tiles) -> npt.NDArray[np.int8]:
 
 def _uncentred(vectors: npt.NDArray[np.int8]) -> Tiles:
     return vectors.view(np.uint8) ^ np.uint8(_CENTRE)
-
-
-def _diagonal_coordinate(tiles: Tiles, tile_px: int) -> Distances:
-    """Return the coordinate along the diagonal of the pixel space, a key of `NearestSearch`."""
-    return np.asarray(tiles.sum(axis=1, dtype=np.int64) / tile_px, dtype=np.float64)
 
 
 def _squared_distances(tiles_a: Tiles, tiles_b: Tiles) -> Distances:

@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from research.codebook.basis import database_of
-from sonarpost.codec.vq import tile_search as module
 from sonarpost.codec.vq.codebook import load_default
 from sonarpost.codec.vq.tile_search import NearestSearch
 
@@ -18,10 +17,8 @@ def brute_force(vectors: np.ndarray, queries: np.ndarray, count: int) -> tuple[n
     return index, np.take_along_axis(squared, index, axis=1)
 
 
-def check(vectors: np.ndarray, queries: np.ndarray, count: int, leading: int) -> None:
-    search = NearestSearch.over(vectors, vectors[:, 0].astype(np.float64), leading)
-    wide = queries.astype(np.float64)
-    index, squared = search.nearest(wide, wide[:, 0], count)
+def check(vectors: np.ndarray, queries: np.ndarray, count: int) -> None:
+    index, squared = NearestSearch.over(vectors).nearest(queries.astype(np.float64), count)
     expected_index, expected_squared = brute_force(vectors, queries, count)
     assert np.array_equal(squared, expected_squared)
     assert np.array_equal(index, expected_index)
@@ -34,46 +31,30 @@ def check(vectors: np.ndarray, queries: np.ndarray, count: int, leading: int) ->
     dims=st.integers(1, 7),
     largest=st.sampled_from([0, 1, 3, 100, 8_000_000]),
     count=st.integers(1, 12),
-    leading=st.integers(1, 7),
 )
-def test_search_is_exact_with_ties_and_duplicates(seed, vectors, queries, dims, largest, count, leading):
+def test_search_is_exact_with_ties_and_duplicates(seed, vectors, queries, dims, largest, count):
     rng = np.random.default_rng(seed)
     stored = rng.integers(-largest, largest + 1, (vectors, dims), dtype=np.int32)
     query_vectors = rng.integers(-largest, largest + 1, (queries, dims), dtype=np.int32)
     query_vectors[::2] = stored[rng.integers(0, vectors, query_vectors[::2].shape[0])]
-    check(stored, query_vectors, min(count, vectors), min(leading, dims))
+    check(stored, query_vectors, min(count, vectors))
 
 
 @pytest.mark.parametrize(("size", "count"), [(2047, 8), (2048, 1), (2049, 200), (5000, 8)])
-def test_search_is_exact_across_blocks(size: int, count: int) -> None:
+def test_search_is_exact_across_groups(size: int, count: int) -> None:
     rng = np.random.default_rng(size)
     stored = (rng.standard_normal((size, 20)) * np.geomspace(3e6, 1e4, 20)).astype(np.int32)
-    stored[size // 2 :: 7] = stored[0]  # duplicates, distributed over the blocks
+    stored[size // 2 :: 7] = stored[0]  # duplicates, distributed over the groups
     queries = (rng.standard_normal((20, 20)) * np.geomspace(4e6, 1e4, 20)).astype(np.int32)
     queries[0] = stored[0]
-    check(stored, queries, count, 9)
+    check(stored, queries, count)
 
 
 def test_distances_closer_than_single_precision_are_distinguished() -> None:
     # Around 8e6 the squares are near 6e13, where single precision has steps of 4 million.
     rng = np.random.default_rng(0)
     stored = (8_000_000 + rng.integers(-3, 4, (3000, 30))).astype(np.int32)
-    check(stored, stored[:50] + 1, 8, 12)
-
-
-def test_distant_blocks_are_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(1)
-    stored = rng.integers(-1000, 1001, (8 * module.BLOCK_TILES, 3), dtype=np.int32)
-    stored[:, 0] *= 1000
-    search = NearestSearch.over(stored, stored[:, 0].astype(np.float64), 3)
-    compared = []
-    compare = module._SearchState.compare
-    monkeypatch.setattr(
-        module._SearchState, "compare", lambda self, s, r, f: (compared.append(s.size), compare(self, s, r, f))
-    )
-    queries = stored[:64].astype(np.float64)
-    assert np.array_equal(search.nearest(queries, queries[:, 0], 1)[0][:, 0], np.arange(64))
-    assert sum(compared) < 0.25 * 64 * len(stored)
+    check(stored, stored[:50] + 1, 8)
 
 
 def test_search_in_the_shipped_codebook_is_exact() -> None:

@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from sonarpost.codec.vq.tile_search import LEADING, Distances, Indices, NearestSearch
+from sonarpost.codec.vq.tile_search import Distances, Indices, NearestSearch
 from sonarpost.errors import CodebookError
 
 MIN_TILE_PX = 4
@@ -140,14 +140,12 @@ class TileDatabase:
         for start in range(0, tiles.shape[0], _QUERY_ROWS):
             rows = slice(start, start + _QUERY_ROWS)
             queries = self.project(tiles[rows])
-            indices[rows], squared[rows] = self._search.nearest(queries, queries[:, 0], count)
+            indices[rows], squared[rows] = self._search.nearest(queries, count)
         return indices, np.sqrt(squared) / BASIS_SCALE
 
     @cached_property
     def _search(self) -> NearestSearch:
-        # 32 x 32 px have coordinates of at most 32 * 255 * 4096 < 2^31.
-        vectors = self.projections.astype(np.int32)
-        return NearestSearch.over(vectors, self.projections[:, 0], min(self.dims, LEADING))
+        return NearestSearch.over(self.projections)
 
 
 def cut_tiles(image: npt.NDArray[np.uint8], tile_px: int) -> Tiles:
