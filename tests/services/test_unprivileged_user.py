@@ -18,11 +18,11 @@ __all__ = ["installation"]
 
 pytestmark = pytest.mark.system
 
-IN_MEMORY = "Preparing machine code for the vq codec: about 2 s, in each process: no folder for it is writable"
+IN_MEMORY = "Preparing machine code for the emb codec: about 10 s, in each process: no folder for it is writable"
 PYTHON_API = """
 import numpy, sonarpost
 image = numpy.random.default_rng(1).integers(0, 256, (40, 60), dtype=numpy.uint8)
-assert sonarpost.decode(sonarpost.encode(image, "vq")).shape == image.shape
+assert sonarpost.decode(sonarpost.encode(image, budget=64)).shape == image.shape
 print("decoded")
 """
 
@@ -46,7 +46,7 @@ def test_encode_compiles_in_memory_and_warns_once(installation, image_file, tmp_
     out = tmp_path / "out"
     out.mkdir()
     out.chmod(0o777)
-    done = installation.run("-m", "sonarpost.cli.main", "encode", "--codec", "vq", "--out", str(out), str(image_file))
+    done = installation.run("-m", "sonarpost.cli.main", "encode", "--out", str(out), str(image_file))
     assert done.returncode == 0, done.stderr
     assert len(list(out.iterdir())) == 1
     [warning] = done.stderr.splitlines()
@@ -55,7 +55,7 @@ def test_encode_compiles_in_memory_and_warns_once(installation, image_file, tmp_
 
 def test_code_prepared_by_the_installing_user_is_loaded(installation, image_file):
     encode = "import sys, numpy, sonarpost; from sonarpost.codec.jit import compilation_log as log; "
-    encode += "sonarpost.encode(numpy.zeros((40, 60), 'uint8'), 'vq'); print(log.compiled)"
+    encode += "sonarpost.encode(numpy.zeros((40, 60), 'uint8'), budget=64); print(log.compiled)"
     for folder in installation._folder.rglob("*"):
         if folder.is_dir():
             folder.chmod(0o755)
