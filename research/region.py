@@ -15,6 +15,7 @@ import numpy as np
 from research.common.command import command_parser, run_command
 from research.common.emb_estimate import encode_with_estimate
 from research.common.images import sdvd_crops
+from research.common.scene_measures import clipped_psnr_db
 from sonarpost.codec.emb.codec import EmbCodec
 from sonarpost.codec.emb.side_info import SIXTEENTHS, RegionOfInterest
 from sonarpost.codec.interface import Image
@@ -23,12 +24,6 @@ from sonarpost.codec.region import BOX_STEPS, RegionBox
 BOXES: Final = {"3/8 of the sides": RegionBox(10, 10, 22, 22), "1/2 of the sides": RegionBox(8, 8, 24, 24)}
 """Boxes around the centre, where the target is."""
 BYTES: Final = (48, 96, 192)
-
-
-def psnr_db(original: Image, decoded: Image) -> float:
-    """Return the PSNR of an image of 8 bits."""
-    error = float(np.mean((original.astype(np.float64) - decoded.astype(np.float64)) ** 2))
-    return 10.0 * float(np.log10(255.0**2 / max(error, 0.065)))
 
 
 def measure(
@@ -43,7 +38,11 @@ def measure(
     weighted = encode_with_estimate(codec, image, more_bytes, region=region).stream
     alone = codec.encode(inside, more_bytes)
     whole = [codec.decode(stream).image[top:bottom, left:right] for stream in (continued, weighted)]
-    return psnr_db(inside, whole[0]), psnr_db(inside, whole[1]), psnr_db(inside, codec.decode(alone).image)
+    return (
+        clipped_psnr_db(inside, whole[0]),
+        clipped_psnr_db(inside, whole[1]),
+        clipped_psnr_db(inside, codec.decode(alone).image),
+    )
 
 
 def new_parser() -> argparse.ArgumentParser:

@@ -161,7 +161,7 @@ def _new_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
         "uuv-1": fleet.issue("uuv-1", "uuv").folder,
         "console-1": fleet.issue("console-1", "console").folder,
         "observer-1": fleet.issue("observer-1", "observer").folder,
-        # CertificateEntry 40 days ago for 10 days by the same authority.
+        # Issued 40 days ago for 10 days by the same authority.
         "expired": Fleet(fleet.folder, lambda: b"", shifted(-40)).issue("vessel-4", "vessel", days=10).folder,
         "nameless": fleet.issue("shore-2", "shore", ["elsewhere.example"]).folder,
     }
