@@ -8,7 +8,7 @@ import threading
 
 import pytest
 import zenoh
-from builders.common import eventually, free_port, publish_once
+from builders.common import eventually, free_port, publish_once, running
 from builders.records import decision_record, reconstructed_image
 from builders.shore import Site
 from builders.store_steps import queued_items
@@ -189,10 +189,8 @@ def test_export_needs_an_output_and_reports_rejected_files(capsys, out, tmp_path
 
 @pytest.fixture
 def c2(platform, tmp_path):
-    service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "live"))
-    assert service.start()
-    yield service
-    service.stop()
+    with running(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "live"))) as service:
+        yield service
 
 
 def test_comment_is_stored_by_c2_when_the_command_ends(capsys, c2, router, tmp_path):

@@ -3,7 +3,7 @@
 import os
 
 import pytest
-from builders.common import eventually
+from builders.common import eventually, running
 from builders.exports import FIRST_UTC_S, decision, image, mission, store
 
 from sonarpost import keys, wire
@@ -139,16 +139,12 @@ def test_all_kinds_of_contacts(tmp_path):
 
 
 def test_c2_files_are_readable(tmp_path, platform):
-    service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out"))
-    assert service.start()
-    try:
+    with running(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "out"))) as service:
         records = {keys.image_reconstructed("vessel-1"): image(), keys.contact_decision("vessel-1"): decision()}
         for key, record in records.items():
             envelope = Relayed(vessel_id="vessel-1", key=key, payload=wire.encode(record), relayed_utc_s=1.0)
             service.session.put(keys.shore_inbox("vessel-1"), wire.encode(envelope))
         eventually(lambda: service.health().counters.get("records_handled") == 2)
-    finally:
-        service.stop()
     found = load_contacts(tmp_path / "out")
     assert found.problems == found.unmatched == ()
     assert [(c.name, c.decision) for c in found.contacts] == [("uuv-1/00A7", decision())]

@@ -7,7 +7,7 @@ import sys
 import time
 
 import pytest
-from builders.common import eventually
+from builders.common import eventually, running
 
 from sonarpost.config import ServiceConfig
 from sonarpost.messages import Health
@@ -134,9 +134,7 @@ class Idle(Service[ServiceConfig]):
 
 def test_command_reports_a_running_service_as_healthy(platform, path, monkeypatch):
     monkeypatch.setenv(heartbeat.VARIABLE, str(path))
-    service = Idle(platform("vessel-1"), ServiceConfig())
-    assert service.start()
-    try:
+    with running(Idle(platform("vessel-1"), ServiceConfig())) as service:
         eventually(path.exists, what="a heartbeat")
         done = subprocess.run(
             [sys.executable, "-m", "sonarpost.monitoring.healthcheck"],
@@ -150,6 +148,4 @@ def test_command_reports_a_running_service_as_healthy(platform, path, monkeypatc
         eventually(
             lambda: health_problem(path, time.monotonic()) == "degraded: the disk is full", what="the degraded state"
         )
-    finally:
-        service.stop()
     assert json.loads(path.read_bytes())["state"] == "stopping"

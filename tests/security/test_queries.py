@@ -3,7 +3,7 @@
 import msgpack
 import pytest
 import zenoh
-from builders.common import WAIT_S, eventually
+from builders.common import WAIT_S, eventually, running
 from builders.records import decision_record
 
 from sonarpost import keys, wire
@@ -27,10 +27,8 @@ def c2(world, tmp_path, monkeypatch):
     platform = PlatformConfig(
         id="shore-1", router=(world.shore_local,), state_dir=tmp_path / "state", health_interval_s=1.0
     )
-    service = C2Service(platform, C2Config(out_dir=tmp_path / "out"))
-    assert service.start()
-    yield service
-    service.stop()
+    with running(C2Service(platform, C2Config(out_dir=tmp_path / "out"))) as service:
+        yield service
 
 
 def received(session, selector):

@@ -7,7 +7,7 @@ import threading
 import numpy as np
 import pytest
 import zenoh
-from builders.common import eventually, publish_once
+from builders.common import eventually, publish_once, running
 from builders.exports import decision, image
 from builders.unreached_router import check_unreached_router
 from mcap.reader import make_reader
@@ -74,9 +74,7 @@ def test_recorded_file_has_records_and_foxglove_channels(router, client, tmp_pat
 
 def test_replay_to_c2_stores_every_record_once(platform, router, tmp_path, capsys):
     path = record_file(tmp_path / "a.mcap")
-    service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "live"))
-    assert service.start()
-    try:
+    with running(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "live"))) as service:
         arguments = ["replay", str(path), "--router", router, "--to-c2", "--speed", "0"]
         for _ in range(2):
             assert main(arguments) == 0
@@ -86,8 +84,6 @@ def test_replay_to_c2_stores_every_record_once(platform, router, tmp_path, capsy
         assert service.health().counters["decisions_stored"] == 1
         assert len(list((tmp_path / "live" / "vessel-1").glob("*.png"))) == IMAGES
         assert len(list((tmp_path / "live" / "vessel-1" / "decisions").glob("*.json"))) == 1
-    finally:
-        service.stop()
 
 
 def coded(number):
@@ -133,9 +129,7 @@ def test_replay_to_c2_delivers_coded_images_once(platform, router, client, tmp_p
     recording.close()
     seen = []
     client.declare_subscriber(keys.shore_coded("vessel-1"), seen.append)
-    service = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "live"))
-    assert service.start()
-    try:
+    with running(C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "live"))) as service:
         for _ in range(2):
             assert main(["replay", str(path), "--router", router, "--to-c2", "--speed", "0"]) == 0
             assert f"{3 * IMAGES} records sent, 0 refused, 1 of other keys" in capsys.readouterr().out
@@ -153,8 +147,6 @@ def test_replay_to_c2_delivers_coded_images_once(platform, router, client, tmp_p
         assert {record.image_id: record for record in records} == {record.image_id: record for record, _ in sent}
         numbers = {wire.unpack_map(s.payload.to_bytes(), "k")["accepted"]["seq"] for s in seen}
         assert len(numbers) == IMAGES
-    finally:
-        service.stop()
 
 
 def test_replay_for_watchers_is_not_handled_by_services(platform, router, tmp_path, capsys):

@@ -7,7 +7,7 @@ import sys
 import urllib.request
 
 import pytest
-from builders.common import eventually, free_port
+from builders.common import eventually, free_port, running
 from prometheus_client import generate_latest
 from prometheus_client.openmetrics.exposition import generate_latest as openmetrics
 from prometheus_client.openmetrics.parser import text_string_to_metric_families as parse_openmetrics
@@ -110,17 +110,13 @@ def scrape(url):
 
 
 def test_running_service_is_scraped_and_its_series_end_with_it(exporter, platform, tmp_path):
-    service = C2Service(platform("shore-1"), C2Config(out_dir=platform("shore-1").state_dir / "out"))
-    assert service.start()
-    try:
+    with running(C2Service(platform("shore-1"), C2Config(out_dir=platform("shore-1").state_dir / "out"))) as service:
         who = ("shore-1", "c2")
         eventually(
             lambda: ("sonarpost_inbox", *who) in (found := scrape(exporter)) and found["sonarpost_up", *who] == 1
         )
         service.count("images_stored", 5)
         eventually(lambda: scrape(exporter).get(("sonarpost_images_stored_total", *who)) == 5)
-    finally:
-        service.stop()
     eventually(lambda: ("sonarpost_inbox", *who) not in scrape(exporter), what="the end of stale series")
     assert scrape(exporter)["sonarpost_up", *who] == 0
 
