@@ -34,6 +34,7 @@ from sonarpost.errors import ConfigError
 from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
 from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.files import write_atomically
+from sonarpost.sonar.options import SurveyOptions
 
 Floats = npt.NDArray[np.float64]
 
@@ -75,7 +76,7 @@ def mines_of_file(seabed: SeabedKind, seed: int) -> list[Mine]:
     """Simulate a file of 1000 pings, detect, and return its mine-like objects on seabed of known difficulty."""
     changes = _VARIATIONS[seed % len(_VARIATIONS)]
     simulated = simulate_survey(replace(SurveySpec(seed=seed, seabed=seabed, targets=4, clutter=6), **changes))
-    result = search(simulated.survey, _ALL_CONTACTS)
+    result = search(simulated.survey, _ALL_CONTACTS, SurveyOptions())
     confidences: dict[int, float] = {}
     for d in result.detections:
         scale = Scale(d.pixel_along_m or _ALL_CONTACTS.assumed_row_along_m, d.pixel_across_m)

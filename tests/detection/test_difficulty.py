@@ -151,10 +151,13 @@ def test_search_rates_each_side_at_its_threshold(one_object, make_survey, monkey
     survey, _ = one_object
     calls, original = [], detector.matched_response
     monkeypatch.setattr(detector, "matched_response", lambda *a: calls.append(1) or original(*a))
-    low, high = (search(survey, DetectorSettings(confidence_threshold=c)).difficulties for c in (0.1, 1.9))
+    low, high = (
+        search(survey, DetectorSettings(confidence_threshold=c), SurveyOptions()).difficulties for c in (0.1, 1.9)
+    )
     assert len(calls) == 2 * 2, "the matched filter runs once a side"
     assert set(low) == set(Side)
-    assert search(make_survey(scale=0.0)).difficulties == {Side.PORT: None, Side.STARBOARD: None}, "no echoes"
+    silent = search(make_survey(scale=0.0), DetectorSettings(), SurveyOptions())
+    assert silent.difficulties == {Side.PORT: None, Side.STARBOARD: None}, "no echoes"
     for side in Side:
         assert low[side].area_m2 == high[side].area_m2
         assert low[side].clutter_per_1000_m2 == high[side].clutter_per_1000_m2

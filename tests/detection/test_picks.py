@@ -35,6 +35,7 @@ from sonarpost.sonar.survey import Side
 pytestmark = pytest.mark.usefixtures("few_candidates")
 
 ORIGIN = FileOrigin("0" * 64, "made.xtf", "made")
+DETECTOR = DetectorSettings()
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,7 @@ def file(survey, tmp_path_factory):
     return path
 
 
-def measured(survey, *texts, settings=None):
+def measured(survey, *texts, settings=DETECTOR):
     """Return picked detection, origin and survey row of each pick."""
     source = InMemorySource(survey, SurveyOptions())
     located, errors = locate_picks(source, [parse_pick(text, "test") for text in texts], "test")

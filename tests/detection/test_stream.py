@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.two_frequencies import with_second_frequency
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -211,6 +212,16 @@ def test_another_frequency_is_no_continuation(make_survey, monkeypatch):
     detector = detector_of()
     add(detector, at_frequency(before, 400e3))
     assert not add(detector, at_frequency(after, 900e3)).joined
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_order_of_the_channels_of_two_frequencies_does_not_matter(make_survey, monkeypatch, order):
+    monkeypatch.setattr(stream, "search", lambda *_: SearchResult((), {}))
+    before, after = split(with_second_frequency(make_survey(), 512, 10.0), 100)
+    detector = detector_of()
+    add(detector, before)
+    exchanged = tuple(replace(ping, channels=ping.channels[::order]) for ping in after.pings)
+    assert add(detector, replace(after, pings=exchanged)).joined
 
 
 def test_coordinates_in_metres_show_a_jump(make_survey, monkeypatch):

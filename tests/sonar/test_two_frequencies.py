@@ -28,6 +28,11 @@ def survey():
 @SECOND
 def test_images_and_bottom_track_are_of_the_highest_frequency(samples, range_m, survey, tmp_path):
     alone, both = read_both(survey, tmp_path, samples, range_m)
+    for one, other in zip(alone, both, strict=True):
+        # What is detected and drawn follows from the pings.
+        assert replace(other, channels=()) == replace(one, channels=())
+        described = ([replace(c, samples=None, index=0) for c in ping.channels] for ping in (one, other))
+        assert next(described) == next(described)
     for side in Side:
         assert both.waterfall(side).shape == (120, 256)
         np.testing.assert_array_equal(both.waterfall(side), alone.waterfall(side))

@@ -154,21 +154,18 @@ def detect(
     if isinstance(survey, SurveySource):
         options = options if options is not None else survey.options
         survey = load_survey(survey)
-    return search(survey, settings, options).detections
+    settings = settings if settings is not None else DetectorSettings()
+    return search(survey, settings, options if options is not None else SurveyOptions()).detections
 
 
-def search(
-    survey: Survey, settings: DetectorSettings | None = None, options: SurveyOptions | None = None
-) -> SearchResult:
+def search(survey: Survey, settings: DetectorSettings, options: SurveyOptions) -> SearchResult:
     """Detect the contacts of a survey in memory, count those that lower thresholds would give, and rate the seabed.
 
     Args:
         survey: The recording.
-        settings: None for the defaults. `weaker` is not limited to the maximum number of contacts.
+        settings: `weaker` is not limited to the maximum number of contacts.
         options: As for `detect`.
     """
-    settings = settings if settings is not None else DetectorSettings()
-    options = options if options is not None else SurveyOptions()
     classifier = classifier_of(settings)
     altitude_m = altitudes_m(survey)
     found: list[Detection] = []

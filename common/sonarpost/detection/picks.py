@@ -234,7 +234,7 @@ def measure_picks(
     origin: FileOrigin,
     picks: Sequence[LocatedPick],
     describe: DescribePick[T],
-    settings: DetectorSettings | None = None,
+    settings: DetectorSettings,
 ) -> list[T]:
     """Measure picks, each within a strip of pings around it; only strips with picks are searched.
 
@@ -243,7 +243,7 @@ def measure_picks(
         origin: Its file.
         picks: The picks in this recording.
         describe: Called for each pick, while the pings around it are in memory.
-        settings: None for the defaults; threshold and maximum number of contacts are not applied.
+        settings: Settings of the detector; threshold and maximum number of contacts are not applied.
 
     Returns:
         What `describe` returned, in the order of `picks`.
@@ -251,7 +251,6 @@ def measure_picks(
     Raises:
         SurveyFileError: The file cannot be read.
     """
-    settings = settings if settings is not None else DetectorSettings()
     overlap = settings.join_overlap_pings
     described: dict[int, T] = {}
     first_open = 0

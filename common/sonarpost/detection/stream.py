@@ -153,7 +153,7 @@ class StreamEnd(Generic[T]):
         """Return this end after its held contacts were given: they are not given again."""
         return replace(self, reported=(*self.reported, *(contact.place for contact in self.held)), held=())
 
-    def continued_by(self, first: Ping, sounded: Ping | None = None) -> StreamEnd[T] | None:
+    def continued_by(self, first: Ping, sounded: Ping) -> StreamEnd[T] | None:
         """Return the part of this end before `first`, the first ping of another file of the same sonar.
 
         A recorder may repeat the last pings at the beginning of the next file; the repeated ones are left out. The
@@ -161,7 +161,7 @@ class StreamEnd(Generic[T]):
 
         Args:
             first: The first ping.
-            sounded: The first ping with channels; None if it is `first`, or unknown.
+            sounded: The first ping with channels; a later ping of the file if it is unknown.
 
         Returns:
             None if that file does not continue the recording: the gap exceeds three ping intervals (at least one
@@ -176,8 +176,7 @@ class StreamEnd(Generic[T]):
         if first.time_utc_s - last.time_utc_s > max(_MIN_GAP_LIMIT_S, _GAP_LIMIT_INTERVALS * interval_s):
             return None
         ours = next((ping for ping in reversed(self.pings[:count]) if ping.channels), None)
-        theirs = first if sounded is None else sounded
-        if ours is not None and theirs.channels and not _same_channels(ours, theirs):
+        if ours is not None and sounded.channels and not _same_channels(ours, sounded):
             return None
         if not _is_near(last, first):
             return None

@@ -27,7 +27,7 @@ from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.input_folder import InputFile, StableFiles, list_input_files
 from sonarpost.services.atd_stub.snippet_files import read_snippet, write_snippet
 from sonarpost.sonar.image_files import read_image, write_tiff
-from sonarpost.sonar.options import ErrorBudget, Mounting
+from sonarpost.sonar.options import Mounting
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.side_car import SideCar, contact_text, read_side_car
 from sonarpost.sonar.source import load_survey
@@ -70,14 +70,6 @@ def test_a_contact_has_every_field_of_the_record(line):
     assert contact.height_m == pytest.approx(
         found.shadow_m * found.altitude_m / (found.slant_range_m + found.shadow_m), rel=1e-9
     )
-
-
-def test_the_position_error_follows_from_the_configured_error_budget(line):
-    _, _, default = best_contact_of(line, AtdStubConfig())
-    assert 5 < default.position_sigma_m < 8
-    _, _, precise = best_contact_of(line, AtdStubConfig(errors=ErrorBudget(position_m=0.5)))
-    assert precise.position_sigma_m < default.position_sigma_m - 3
-    assert (precise.lat_deg, precise.lon_deg) == (default.lat_deg, default.lon_deg)
 
 
 def test_a_truncated_shadow_gives_no_height(line):
