@@ -194,7 +194,7 @@ def test_error_ellipse_matches_monte_carlo():
         n, e = offset_between_m(got.position, place.position)
         north.append(n + rng.normal(0, 1))
         east.append(e + rng.normal(0, 1))
-    bearing = math.radians(got.bearing_deg)
+    bearing = math.radians(30 + 90)
     across = np.array(north) * math.cos(bearing) + np.array(east) * math.sin(bearing)
     along = np.array(east) * math.cos(bearing) - np.array(north) * math.sin(bearing)
     assert across.std() == pytest.approx(got.across_sigma_m, rel=0.08)

@@ -181,21 +181,6 @@ def _window(centre: int, size: int, limit: int) -> tuple[int, int]:
     return min(max(centre - length // 2, 0), limit - length), length
 
 
-@dataclass(frozen=True, slots=True)
-class _GroundPlace:
-    """Place of a contact on the bottom: ground range, altitude of the sonar above it, distance between pings."""
-
-    altitude_m: float
-    range_m: float
-    along_m: float
-
-
-def _ground_place(detection: Detection) -> _GroundPlace | None:
-    if detection.altitude_m is None or detection.ground_range_m is None or detection.pixel_along_m is None:
-        return None
-    return _GroundPlace(detection.altitude_m, detection.ground_range_m, detection.pixel_along_m)
-
-
 def ground_projected_image(
     survey: Survey, detection: Detection, height_px: int, width_px: int, pixel_m: float
 ) -> npt.NDArray[np.uint8] | None:
@@ -213,16 +198,18 @@ def ground_projected_image(
         range of the sonar, and on the other side of the nadir. None if altitude or distance between pings is unknown,
         or if the pixels are too small for the range of the sonar.
     """
-    place = _ground_place(detection)
-    if place is None or survey.max_slant_range_m(detection.side) / pixel_m > MAX_COLUMNS:
+    altitude_m, range_m, along_m = detection.altitude_m, detection.ground_range_m, detection.pixel_along_m
+    if altitude_m is None or range_m is None or along_m is None:
+        return None
+    if survey.max_slant_range_m(detection.side) / pixel_m > MAX_COLUMNS:
         return None
     # Edges of the rows, in pings from the beginning of the survey.
-    edges = detection.ping_index + 0.5 + (np.arange(height_px + 1) - height_px / 2) * pixel_m / place.along_m
+    edges = detection.ping_index + 0.5 + (np.arange(height_px + 1) - height_px / 2) * pixel_m / along_m
     first, end = max(int(edges[0]), 0), min(int(np.ceil(edges[-1])), len(survey.pings))
     pings = survey.pings[first:end]
-    altitudes_m = np.array([p.altitude_m if p.altitude_m is not None else place.altitude_m for p in pings])
+    altitudes_m = np.array([p.altitude_m if p.altitude_m is not None else altitude_m for p in pings])
     ground = ground_range_image(replace(survey, pings=pings), detection.side, altitudes_m, pixel_m)
-    left = int(place.range_m / pixel_m) - width_px // 2
+    left = int(range_m / pixel_m) - width_px // 2
     rows = _row_means(_columns(ground, left, width_px), np.asarray(edges - first, dtype=np.float64))
     known = np.isfinite(rows)
     greatest = float(np.max(rows, where=known, initial=0.0))

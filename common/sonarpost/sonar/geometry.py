@@ -231,14 +231,12 @@ class GeoReference:
         ground_range_m: Distance from the track over a flat bottom.
         across_sigma_m: Standard deviation across the track.
         along_sigma_m: Standard deviation along the track.
-        bearing_deg: Bearing from the sonar, from true north; the direction of `across_sigma_m`.
     """
 
     position: Position
     ground_range_m: float
     across_sigma_m: float
     along_sigma_m: float
-    bearing_deg: float
 
     @property
     def sigma_m(self) -> float:
@@ -295,8 +293,7 @@ def georeference(
         budget.layback_m if layback_m else 0.0,
         layback_m * _LAYBACK_SIGMA,
     )
-    bearing_deg = (ping.heading_deg + (90 if side is Side.STARBOARD else -90)) % 360
-    return GeoReference(position, ground_m, across_m, along_m, bearing_deg)
+    return GeoReference(position, ground_m, across_m, along_m)
 
 
 def _ground_sigma_m(
