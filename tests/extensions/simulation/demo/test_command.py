@@ -10,7 +10,7 @@ from sonarpost.services.atd_stub.config import AtdStubConfig
 
 def test_a_foreign_output_folder_is_refused_before_the_survey_is_simulated(tmp_path, monkeypatch, capsys):
     simulated: list[object] = []
-    monkeypatch.setattr(command, "simulated_survey", simulated.append)
+    monkeypatch.setattr(command, "_simulated_survey", simulated.append)
     (tmp_path / "notes.txt").write_text("not of a demo")
     assert main(["demo", "--out", str(tmp_path)]) == 2
     assert "expected a folder that is new, empty or of an earlier demo" in capsys.readouterr().err

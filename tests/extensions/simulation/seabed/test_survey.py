@@ -135,12 +135,11 @@ def test_too_many_objects_are_rejected():
         ("range_m", float("nan")),
         ("altitude_m", 16.0),
         ("ping_rate_hz", 30.0),
-        ("speed_mps", 0.0),
-        ("bits", 12),
         ("targets", -1),
         ("seed", -1),
         ("water_depth_m", 2.0),
-        ("start_lat_deg", 89.0),
+        ("burial", 0.9),
+        ("scour", float("nan")),
     ],
 )
 def test_specification_error_names_the_field(field, value):

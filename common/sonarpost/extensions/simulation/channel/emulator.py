@@ -17,7 +17,7 @@ from typing import IO
 
 from sonarpost.errors import PortError
 from sonarpost.extensions.simulation.channel.config import EmulatorConfig
-from sonarpost.extensions.simulation.channel.host_ports import HostPort, PtyPort, TcpPort
+from sonarpost.extensions.simulation.channel.host_ports import PtyPort, TcpPort
 from sonarpost.extensions.simulation.channel.packet_log import PacketLog, PacketTotals
 from sonarpost.extensions.simulation.channel.simulator import ChannelSimulator, PlacedModem
 from sonarpost.extensions.simulation.modem.receiver import HostOutput, PacketReport
@@ -44,7 +44,7 @@ class Device:
 class _HostLine:
     """A port and its output that is not written yet."""
 
-    port: HostPort
+    port: PtyPort | TcpPort
     was_connected: bool = False
     pending: deque[HostOutput] = field(default_factory=deque)
     pending_bytes: int = 0
@@ -119,7 +119,7 @@ class ChannelEmulator:
         with self._lock:
             return sum(line.port.connected for line in self._lines.values())
 
-    def _open_port(self, number: int) -> HostPort:
+    def _open_port(self, number: int) -> PtyPort | TcpPort:
         if self.config.tcp_ports:
             return TcpPort(self.config.tcp_host, self.config.tcp_ports[number - 1])
         return PtyPort(self.config.pty_dir / f"modem-{number}")

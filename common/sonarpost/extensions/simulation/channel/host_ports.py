@@ -10,52 +10,14 @@ import select
 import socket
 import termios
 import tty
-from abc import ABC, abstractmethod
 from pathlib import Path
-
-from typing_extensions import override
 
 from sonarpost.errors import PortError
 
 READ_BYTES = 65536
 
 
-class HostPort(ABC):
-    """Port of one modem."""
-
-    device: str
-    """The device a host opens: a path, or a pyserial URL."""
-
-    connected: bool = False
-    """Whether a client is connected, as of the last `update_connection`, `read` or `write`."""
-
-    @abstractmethod
-    def update_connection(self) -> None:
-        """Update `connected`."""
-
-    @abstractmethod
-    def read(self) -> bytes:
-        """Return the bytes from the client, possibly none."""
-
-    @abstractmethod
-    def write(self, data: bytes) -> int:
-        """Write as many bytes as possible without blocking and return their number."""
-
-    @abstractmethod
-    def poll_masks(self, *, writing: bool) -> list[tuple[int, int]]:
-        """Return (file descriptor, poll mask) pairs to wait on; `writing` when output is pending."""
-
-    @property
-    @abstractmethod
-    def needs_polling(self) -> bool:
-        """Whether `update_connection` must be called periodically, as no descriptor reports the next change."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Close the port and remove its name."""
-
-
-class PtyPort(HostPort):
+class PtyPort:
     """A pseudo-terminal behind a symbolic link whose name stays the same over restarts.
 
     Args:
@@ -82,6 +44,7 @@ class PtyPort(HostPort):
             os.close(self._master)
             raise PortError(f"{link}: {error}") from error
         self.device = str(link)
+        self.connected = False
         self._poll = select.poll()
         self._poll.register(self._master, select.POLLIN)
 
@@ -94,8 +57,8 @@ class PtyPort(HostPort):
         temporary.symlink_to(self._slave_name)
         temporary.replace(self._link)
 
-    @override
     def update_connection(self) -> None:
+        """Update `connected`."""
         masks = [mask for _, mask in self._poll.poll(0)]
         # Bytes that the client wrote before it left are read first: the flush in `_disconnect` would drop them.
         hung_up = any(mask & select.POLLHUP and not mask & select.POLLIN for mask in masks)
@@ -104,16 +67,16 @@ class PtyPort(HostPort):
         elif not any(mask & select.POLLHUP for mask in masks):
             self.connected = True
 
-    @override
     def read(self) -> bytes:
+        """Return the bytes from the client, possibly none."""
         try:
             return os.read(self._master, READ_BYTES)
         except OSError as error:
             self._check(error)
             return b""
 
-    @override
     def write(self, data: bytes) -> int:
+        """Write as many bytes as possible without blocking and return their number."""
         try:
             return os.write(self._master, data)
         except OSError as error:
@@ -142,20 +105,17 @@ class PtyPort(HostPort):
         finally:
             os.close(slave)
 
-    @override
     def poll_masks(self, *, writing: bool) -> list[tuple[int, int]]:
-        """See `HostPort`; empty without a client, as the terminal then reports POLLHUP at once."""
+        """Return file descriptors with poll masks; none without a client, as the terminal then reports POLLHUP."""
         if not self.connected:
             return []
         return [(self._master, select.POLLIN | (select.POLLOUT if writing else 0))]
 
     @property
-    @override
     def needs_polling(self) -> bool:
-        """A terminal does not report that a client opens it."""
+        """Whether `update_connection` must be called periodically: a terminal does not report that it is opened."""
         return not self.connected
 
-    @override
     def close(self) -> None:
         """Remove the link unless another process has replaced it, then close the terminal.
 
@@ -166,7 +126,7 @@ class PtyPort(HostPort):
         os.close(self._master)
 
 
-class TcpPort(HostPort):
+class TcpPort:
     """A TCP port for `socket://` URLs. A new client replaces the previous one, whose connection may be dead.
 
     Port 0 selects a free one.
@@ -181,11 +141,11 @@ class TcpPort(HostPort):
         except OSError as error:
             raise PortError(f"socket://{host}:{port}: {error}") from error
         self._listener.settimeout(0)
+        self.connected = False
         self._client: socket.socket | None = None
         self._next_client: socket.socket | None = None
         self.device = f"socket://{host}:{self._listener.getsockname()[1]}"
 
-    @override
     def update_connection(self) -> None:
         """Accept a new client; the previous one is reported as disconnected for one call first."""
         if self._next_client is None:
@@ -201,8 +161,8 @@ class TcpPort(HostPort):
         self._client, self._next_client = self._next_client, None
         self.connected = True
 
-    @override
     def read(self) -> bytes:
+        """Return the bytes from the client, possibly none."""
         if self._client is None:
             return b""
         try:
@@ -215,8 +175,8 @@ class TcpPort(HostPort):
             self._disconnect()
         return data
 
-    @override
     def write(self, data: bytes) -> int:
+        """Write as many bytes as possible without blocking and return their number."""
         if self._client is None:
             return 0
         try:
@@ -233,20 +193,18 @@ class TcpPort(HostPort):
         self._client = None
         self.connected = False
 
-    @override
     def poll_masks(self, *, writing: bool) -> list[tuple[int, int]]:
+        """Return file descriptors with the poll masks to wait for; `writing` when output is pending."""
         masks = [(self._listener.fileno(), select.POLLIN)]
         if self._client is not None:
             masks.append((self._client.fileno(), select.POLLIN | (select.POLLOUT if writing else 0)))
         return masks
 
     @property
-    @override
     def needs_polling(self) -> bool:
         """Whether a new client waits for the next `update_connection`."""
         return self._next_client is not None
 
-    @override
     def close(self) -> None:
         """Close the listener and the clients."""
         for each in (self._listener, self._client, self._next_client):

@@ -20,9 +20,9 @@ from rich.console import Console
 from sonarpost.cli.parsing.parser import CommandParser
 from sonarpost.cli.progress import ProgressDisplay, progress_console
 from sonarpost.cli.shared import add_fit_option, add_survey_options, flag, option, print_notes, survey_options_of
-from sonarpost.errors import ConfigError
+from sonarpost.codec.fitting import Fit, fit_image
+from sonarpost.errors import BadInputError, ConfigError, SurveyFileError
 from sonarpost.extensions.simulation.demo.chain import Chain
-from sonarpost.extensions.simulation.demo.inputs import deposit, simulated_survey, survey_files, usable_images
 from sonarpost.extensions.simulation.demo.outcome import evaluate
 from sonarpost.extensions.simulation.demo.report import show, shown
 from sonarpost.extensions.simulation.demo.settings import (
@@ -34,10 +34,15 @@ from sonarpost.extensions.simulation.demo.settings import (
 )
 from sonarpost.extensions.simulation.demo.watch import Watcher
 from sonarpost.extensions.simulation.modem.emulated import emulated_drivers
+from sonarpost.extensions.simulation.seabed.survey import SurveySpec, simulate_survey
+from sonarpost.extensions.simulation.seabed.terrain import SeabedKind
 from sonarpost.extensions.simulation.seabed.xtf_writer import write_xtf
 from sonarpost.modem.registry import DEFAULT_DRIVER, modem_driver
 from sonarpost.services.console.store.users import FILE_NAME, LINK_S, Users, login_link
-from sonarpost.sonar.readers import open_survey
+from sonarpost.sonar.image_decoding import read_any_image
+from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX, list_images
+from sonarpost.sonar.readers import open_survey, recording_parts, supported_suffixes
+from sonarpost.sonar.side_car import read_side_car
 from sonarpost.sonar.survey import Survey
 
 MARKER = ".sonarpost-demo"
@@ -119,9 +124,9 @@ def run(parsed: argparse.Namespace) -> int:
     detection_settings = _detection_settings(parsed)
     files: tuple[Path, ...] = ()
     if parsed.images is not None:
-        files = usable_images(parsed.images, parsed.fit, console)
+        files = _usable_images(parsed.images, parsed.fit, console)
     elif parsed.survey is not None:
-        files = survey_files(parsed.survey)
+        files = _survey_files(parsed.survey)
         if files == (parsed.survey,):
             # A single file that cannot be read is reported before the services start.
             with open_survey(parsed.survey, survey_options_of(parsed)) as source:
@@ -141,8 +146,96 @@ def run(parsed: argparse.Namespace) -> int:
             console_port=ports[3] if parsed.console else None,
             extra=(*detection_settings, ("atd_stub", f'fit = "{parsed.fit}"')),
         )
-        source_of = files or simulated_survey(parsed.seed, console)
+        source_of = files or _simulated_survey(parsed.seed, console)
         return _run_chain(parsed, settings, source_of, started_s, console)
+
+
+def _simulated_survey(seed: int, console: Console) -> Survey:
+    """Return a simulated survey; print what it holds."""
+    with console.status("simulating a survey of 1000 pings"):
+        simulated = simulate_survey(SurveySpec(seed=seed, seabed=SeabedKind.SAND, targets=6, clutter=6))
+    mines = sum(truth.is_mine_like for truth in simulated.truth)
+    console.print(
+        f"simulated survey of {len(simulated.survey.pings)} pings over sand: "
+        f"{mines} mine-like objects, {len(simulated.truth) - mines} others"
+    )
+    return simulated.survey
+
+
+def _survey_files(given: Path) -> tuple[Path, ...]:
+    """Return a survey file, or those of a folder.
+
+    Raises:
+        SurveyFileError: There is no such file or folder, or no suitable file in it.
+    """
+    suffixes = supported_suffixes()
+    if not given.exists():
+        raise SurveyFileError(str(given), "", "no such file or folder", "a file or folder that exists")
+    if not given.is_dir():
+        if not given.name.lower().endswith(suffixes):
+            raise SurveyFileError(str(given), "suffix", given.suffix, "one of " + ", ".join(suffixes))
+        return (given,)
+    found = tuple(sorted(p for p in given.iterdir() if p.name.lower().endswith(suffixes) and p.is_file()))
+    if not found:
+        raise SurveyFileError(str(given), "", "no such file in it", "files named *" + ", *".join(suffixes))
+    return found
+
+
+def _usable_images(source: Path, fit: Fit, console: Console) -> tuple[Path, ...]:
+    """Return the images that the vehicle can send; print conversions and unused files.
+
+    Args:
+        source: An image or a folder of images, each with a side-car or without.
+        fit: What the vehicle does with an image outside 16..512 px a side.
+        console: Output.
+
+    Raises:
+        BadInputError: There is no such file or folder, or no image that can be sent.
+    """
+    if not source.exists():
+        raise SurveyFileError(str(source), "", "no such file or folder", "an image or a folder of images")
+    found = list_images(source) if source.is_dir() else None
+    lines = list(found.unused) if found else []
+    usable: list[Path] = []
+    errors: list[BadInputError] = []
+    for path in found.images if found else (source,):
+        try:
+            image = read_any_image(path)
+            notes = image.notes + fit_image(image.pixels, fit, str(path)).notes
+            side_car = path.with_suffix(SIDE_CAR_SUFFIX)
+            if side_car.is_file():
+                notes += read_side_car(side_car, "check", "uuv-1").notes
+            lines += [f"{path}: {note}" for note in notes]
+            usable.append(path)
+        except BadInputError as error:
+            errors.append(error)
+            lines.append(f"not used: {error}")
+    if errors and not usable:
+        raise errors[0]
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    return tuple(usable)
+
+
+def _deposit(paths: tuple[Path, ...], settings: ChainSettings, console: Console) -> None:
+    """Copy files, with their side-cars or other parts, into the folder that the vehicle polls."""
+    side_cars = 0
+    for path in paths:
+        others = [path.with_suffix(SIDE_CAR_SUFFIX)]
+        if settings.mode == "survey":
+            others = [part for part in recording_parts(path) if part != path and part.is_relative_to(path.parent)]
+        present = [other for other in others if other.is_file()]
+        side_cars += len(present)
+        for other in present:
+            target = settings.incoming / other.relative_to(path.parent)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(other, target)
+        partial = settings.incoming / f".{path.name}"
+        shutil.copyfile(path, partial)
+        partial.rename(settings.incoming / path.name)
+    if settings.mode == "snippets":
+        console.print(f"{side_cars} of {len(paths)} images have a side-car with their position")
+    console.print(f"{len(paths)} input file{'s' if len(paths) != 1 else ''}")
 
 
 def _run_chain(
@@ -162,7 +255,7 @@ def _run_chain(
         if isinstance(inputs, Survey):
             write_xtf(inputs, settings.incoming / f"simulated-{settings.seed}.xtf")
         else:
-            deposit(inputs, settings, console)
+            _deposit(inputs, settings, console)
         count = 1 if isinstance(inputs, Survey) else len(inputs)
         with console.status("starting three routers and eight services"):
             watcher.wait_until_started()
