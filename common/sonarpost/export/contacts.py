@@ -45,7 +45,6 @@ MAX_FILE_BYTES: Final = 1 << 22
 DECISIONS: Final = "decisions"
 _RUN_BYTES: Final = 256
 
-R = TypeVar("R", bound=Record)
 N = TypeVar("N", int, float)
 
 
@@ -220,6 +219,9 @@ class ContactSet:
         return tuple(c for c in self.contacts if c.position is None)
 
 
+R = TypeVar("R", ImageSideCar, Decision)
+
+
 @dataclass(frozen=True, slots=True)
 class StoredRecords:
     """Files of the c2 service's folder.
@@ -287,14 +289,9 @@ def read_stored_records(out_dir: Path) -> StoredRecords:
     images: list[tuple[ImageSideCar, Path]] = []
     decisions: list[Decision] = []
     for folder in _vessel_folders(out_dir):
-        for path in _json_files(folder, problems):
-            image = _read(ImageSideCar, path, problems)
-            if image is not None and _is_of_vessel(image, folder, path, problems):
-                images.append((image.model_copy(update={"missing_runs": ""}), path))
-        for path in _json_files(folder / DECISIONS, problems):
-            decision = _read(Decision, path, problems)
-            if decision is not None and _is_of_vessel(decision, folder, path, problems):
-                decisions.append(decision)
+        for image, path in _records(ImageSideCar, folder, folder.name, problems):
+            images.append((image.model_copy(update={"missing_runs": ""}), path))
+        decisions += [decision for decision, _ in _records(Decision, folder / DECISIONS, folder.name, problems)]
     return StoredRecords(tuple(images), tuple(decisions), tuple(problems))
 
 
@@ -335,22 +332,20 @@ def _json_files(folder: Path, problems: list[BadInputError]) -> list[Path]:
         return []
 
 
-def _read(model: type[R], path: Path, problems: list[BadInputError]) -> R | None:
-    try:
-        return model.model_validate_json(read_regular(path, MAX_FILE_BYTES))
-    except OSError as error:
-        problems.append(StoredFileError(str(path), "", error.strerror or str(error), f"a readable {model.TYPE}"))
-    except ValidationError as error:
-        problems.append(StoredFileError(str(path), *first_error(error)))
-    return None
-
-
-def _is_of_vessel(record: ImageSideCar | Decision, folder: Path, path: Path, problems: list[BadInputError]) -> bool:
-    """Return whether a record names the vessel of its folder; otherwise report a problem."""
-    if record.vessel_id == folder.name:
-        return True
-    problems.append(StoredFileError(str(path), "vessel_id", record.vessel_id, folder.name))
-    return False
+def _records(model: type[R], folder: Path, vessel_id: str, problems: list[BadInputError]) -> Iterator[tuple[R, Path]]:
+    """Yield the records of a vessel in a folder with their files; report a problem for each other file."""
+    for path in _json_files(folder, problems):
+        try:
+            record = model.model_validate_json(read_regular(path, MAX_FILE_BYTES))
+        except OSError as error:
+            problems.append(StoredFileError(str(path), "", error.strerror or str(error), f"a readable {model.TYPE}"))
+        except ValidationError as error:
+            problems.append(StoredFileError(str(path), *first_error(error)))
+        else:
+            if record.vessel_id == vessel_id:
+                yield record, path
+            else:
+                problems.append(StoredFileError(str(path), "vessel_id", record.vessel_id, vessel_id))
 
 
 _Name = tuple[str, str, str]
