@@ -4,7 +4,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from builders.console import image_record
+from builders.console import PASSWORD, image_record
 from builders.layout_faults import FAULTS
 
 pytestmark = pytest.mark.parametrize("browser", ["chromium"], indirect=True)
@@ -29,6 +29,11 @@ COVERED = """() => [...(document.querySelector('dialog[open], .panel.open, .menu
   const top = document.elementFromPoint(x, y);
   return !(element.contains(top) || top?.contains(element));
 }).map(element => element.outerHTML.slice(0, 100))"""
+
+
+CANVAS_WITHOUT_NAME = """() => [...document.querySelectorAll('canvas:not([aria-label])')]
+  .filter(element => element.checkVisibility() && !element.closest('[aria-hidden=true]'))
+  .map(element => element.outerHTML.slice(0, 100))"""
 
 
 def visit_at(served, size=(1366, 768), theme="day", **more):
@@ -208,6 +213,8 @@ class Axe:
         assert len(result["passes"]) > 5
         for one in result["violations"]:
             self.found[(*name, one["id"])] = [node["html"][:120] for node in one["nodes"]]
+        if unnamed := page.evaluate(CANVAS_WITHOUT_NAME):
+            self.found[(*name, "canvas")] = unnamed
 
 
 # Colours depend on the theme, names and roles on the size.
@@ -217,6 +224,7 @@ class Axe:
 def test_axe_finds_no_violation(served, theme, sizes):
     visit = visit_at(served, theme=theme)
     page, axe = visit.page, Axe(visit)
+    assert page.evaluate("document.documentElement.dataset.theme") == theme
     for size in sizes:
         visit.resize(*size)
         axe.run(size, "review")
@@ -234,6 +242,28 @@ def test_axe_finds_no_violation(served, theme, sizes):
             visit.settle()
             axe.run(size, key)
         visit.press("q")
+    # After a decision: a request to confirm, a contact on the map, and a password with an error.
+    visit.resize(*sizes[0])
+    visit.decide("2")
+    visit.wait("#result >> text=not mine-like")
+    page.select_option("#review", "all")
+    visit.press("r")
+    visit.wait("[data-request]:focus")
+    axe.run("request")
+    visit.press("Escape")
+    visit.press("p")
+    visit.until("() => document.querySelector('.map').dataset.drawn !== undefined")
+    visit.press("j")
+    visit.wait(".map .card")
+    axe.run("card")
+    page.click("#menu")
+    page.click('.menu [data-item="password"]')
+    page.fill("#password-old", PASSWORD)
+    visit.press("Enter")
+    visit.wait("#password-problem:has-text('this one has 0')")
+    axe.run("password")
+    visit.press("Escape")
+    visit.press("q")
     contact_id = page.evaluate("decodeURIComponent(location.hash.slice(1))")
     for path in (f"report/{contact_id}", "login"):
         page.goto(served.address + path)
