@@ -14,7 +14,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from typing_extensions import override
 
@@ -40,12 +40,6 @@ _NO_CONFIDENCE: Final = 255
 _MAX_VERSION: Final = 255
 
 _HEAD = struct.Struct(">BII")
-_REFINE = struct.Struct(">HH")
-_NUMBER = struct.Struct(">H")
-_REGION = struct.Struct(f">H{PACKED_BYTES}sH")
-_PRIORITISE = struct.Struct(">HB")
-_REVISIT = struct.Struct(">ii")
-_DECISION = struct.Struct(">HBBB")
 _OUTCOME = struct.Struct(">IB")
 
 
@@ -63,18 +57,6 @@ class MessageKind(IntEnum):
     PRIORITISE = 0x09
     DATA = 0x10
     STATUS = 0x11
-
-
-_COMMANDS: Final = (
-    MessageKind.REFINE,
-    MessageKind.RESEND,
-    MessageKind.REVISIT,
-    MessageKind.DECISION,
-    MessageKind.EXPAND,
-    MessageKind.ORIGINAL,
-    MessageKind.REGION,
-    MessageKind.PRIORITISE,
-)
 
 
 class CommandOutcome(IntEnum):
@@ -231,21 +213,6 @@ class DataMessage:
         _check("data", len(self.data), 1, 4095)
 
 
-_IMAGE_KINDS: Final[Mapping[type[ImageCommandMessage], MessageKind]] = {
-    RefineMessage: MessageKind.REFINE,
-    ResendMessage: MessageKind.RESEND,
-    ExpandMessage: MessageKind.EXPAND,
-    OriginalMessage: MessageKind.ORIGINAL,
-    RegionMessage: MessageKind.REGION,
-    PrioritiseMessage: MessageKind.PRIORITISE,
-}
-_NUMBER_MESSAGES: Final[Mapping[MessageKind, type[ResendMessage | ExpandMessage | OriginalMessage]]] = {
-    MessageKind.RESEND: ResendMessage,
-    MessageKind.EXPAND: ExpandMessage,
-    MessageKind.ORIGINAL: OriginalMessage,
-}
-"""Messages that have only the number of the contact."""
-
 DownlinkCommand = (
     RefineMessage
     | ResendMessage
@@ -257,6 +224,19 @@ DownlinkCommand = (
     | PrioritiseMessage
 )
 DownlinkContent = DownlinkCommand | ConfirmationMessage | DataMessage | StatusMessage
+
+_FORMS: Final[Mapping[MessageKind, tuple[type[DownlinkCommand], struct.Struct]]] = {
+    MessageKind.REFINE: (RefineMessage, struct.Struct(">HH")),
+    MessageKind.RESEND: (ResendMessage, struct.Struct(">H")),
+    MessageKind.REVISIT: (RevisitMessage, struct.Struct(">ii")),
+    MessageKind.DECISION: (DecisionMessage, struct.Struct(">HBBB")),
+    MessageKind.EXPAND: (ExpandMessage, struct.Struct(">H")),
+    MessageKind.ORIGINAL: (OriginalMessage, struct.Struct(">H")),
+    MessageKind.REGION: (RegionMessage, struct.Struct(f">H{PACKED_BYTES}sH")),
+    MessageKind.PRIORITISE: (PrioritiseMessage, struct.Struct(">HB")),
+}
+"""Class of each command, and the layout of what follows its head; a decision ends with the text of its class."""
+_KINDS: Final = {command: kind for kind, (command, _) in _FORMS.items()}
 
 
 def pack(content: DownlinkContent, room_bytes: int = SMALLEST_ROOM_BYTES) -> bytes:
@@ -283,35 +263,30 @@ def _packed(content: DownlinkContent, room_bytes: int) -> bytes:
             return bytes([MessageKind.STATUS]) + content.pack()
         case ConfirmationMessage():
             return bytes([MessageKind.CONFIRMATION]) + b"".join(_OUTCOME.pack(*each) for each in content.outcomes)
+        case _:
+            kind = _KINDS[type(content)]
+            fixed = _HEAD.pack(kind, content.token, content.issued_utc_s) + _FORMS[kind][1].pack(*_values(content))
+            text = content.mlo_class if isinstance(content, DecisionMessage) else ""
+            return fixed + _shortened(text, room_bytes - len(fixed))
+
+
+def _values(command: DownlinkCommand) -> tuple[int | bytes, ...]:
+    """Return the fields of a command after its head, as they are sent."""
+    match command:
         case RevisitMessage():
-            degrees = (round(value * _DEGREE_STEPS) for value in (content.lat_deg, content.lon_deg))
-            return _head(MessageKind.REVISIT, content) + _REVISIT.pack(*degrees)
+            return round(command.lat_deg * _DEGREE_STEPS), round(command.lon_deg * _DEGREE_STEPS)
         case DecisionMessage():
-            confidence = _NO_CONFIDENCE if content.confidence is None else round(content.confidence * _CONFIDENCE_STEPS)
-            fixed = _head(MessageKind.DECISION, content) + _DECISION.pack(
-                content.number, min(content.version, _MAX_VERSION), _VERDICTS.index(content.verdict), confidence
-            )
-            return fixed + _shortened(content.mlo_class, room_bytes - len(fixed))
-        case _:
-            return _head(_IMAGE_KINDS[type(content)], content) + _image_fields(content)
-
-
-def _image_fields(
-    content: RefineMessage | ResendMessage | ExpandMessage | OriginalMessage | RegionMessage | PrioritiseMessage,
-) -> bytes:
-    match content:
+            confidence = _NO_CONFIDENCE if command.confidence is None else round(command.confidence * _CONFIDENCE_STEPS)
+            version = min(command.version, _MAX_VERSION)
+            return command.number, version, _VERDICTS.index(command.verdict), confidence
         case RefineMessage():
-            return _REFINE.pack(content.number, content.stream_bytes)
+            return command.number, command.stream_bytes
         case RegionMessage():
-            return _REGION.pack(content.number, content.box.pack(), content.stream_bytes)
+            return command.number, command.box.pack(), command.stream_bytes
         case PrioritiseMessage():
-            return _PRIORITISE.pack(content.number, _PLACES.index(content.place))
+            return command.number, _PLACES.index(command.place)
         case _:
-            return _NUMBER.pack(content.number)
-
-
-def _head(kind: MessageKind, command: CommandMessage) -> bytes:
-    return _HEAD.pack(kind, command.token, command.issued_utc_s)
+            return (command.number,)
 
 
 def _shortened(text: str, max_bytes: int) -> bytes:
@@ -338,7 +313,7 @@ def _content(data: bytes) -> DownlinkContent:
         return StatusMessage.unpack(body)
     if kind == MessageKind.CONFIRMATION:
         return _confirmation(body)
-    if kind not in _COMMANDS:
+    if kind not in _FORMS:
         raise FrameError(_WHERE, "kind", kind, ", ".join(f"{int(known):#04x}" for known in MessageKind))
     if len(data) < _HEAD.size:
         raise FrameError(_WHERE, "length", len(data), f"at least {_HEAD.size} bytes")
@@ -347,55 +322,44 @@ def _content(data: bytes) -> DownlinkContent:
 
 
 def _command(kind: MessageKind, token: int, issued: int, body: bytes) -> DownlinkCommand:
-    if kind in _NUMBER_MESSAGES:
-        return _NUMBER_MESSAGES[kind](token, issued, *_fields(_NUMBER, body))
-    match kind:
-        case MessageKind.REFINE:
-            number, stream_bytes = _fields(_REFINE, body)
-            return RefineMessage(token, issued, number, stream_bytes)
-        case MessageKind.REGION:
-            return _region(token, issued, body)
-        case MessageKind.PRIORITISE:
-            return _prioritise(token, issued, body)
-        case MessageKind.REVISIT:
-            lat, lon = _fields(_REVISIT, body)
-            return RevisitMessage(token, issued, lat / _DEGREE_STEPS, lon / _DEGREE_STEPS)
-    number, version, verdict, confidence = _fields(_DECISION, body[: _DECISION.size])
-    if verdict >= len(_VERDICTS):
-        raise FrameError(_WHERE, "verdict", verdict, f"0..{len(_VERDICTS) - 1}")
-    probability = None if confidence == _NO_CONFIDENCE else confidence / _CONFIDENCE_STEPS
-    try:
-        mlo_class = body[_DECISION.size :].decode()
-    except UnicodeDecodeError as error:
-        raise FrameError(_WHERE, "mlo_class", body[_DECISION.size :], "UTF-8") from error
-    return DecisionMessage(token, issued, number, version, _VERDICTS[verdict], probability, mlo_class)
-
-
-def _prioritise(token: int, issued: int, body: bytes) -> PrioritiseMessage:
-    number, place = _fields(_PRIORITISE, body)
-    if place >= len(_PLACES):
-        raise FrameError(_WHERE, "place", place, f"0..{len(_PLACES) - 1}")
-    return PrioritiseMessage(token, issued, number, _PLACES[place])
-
-
-def _region(token: int, issued: int, body: bytes) -> RegionMessage:
-    _check_length(_REGION, body)
-    number, packed, stream_bytes = _REGION.unpack(body)
-    try:
-        box = RegionBox.unpack(packed)
-    except BadInputError as error:
-        raise FrameError(_WHERE, "box", packed, error.expected) from error
-    return RegionMessage(token, issued, number, box, stream_bytes)
-
-
-def _fields(layout: struct.Struct, body: bytes) -> tuple[int, ...]:
-    _check_length(layout, body)
-    return layout.unpack(body)
-
-
-def _check_length(layout: struct.Struct, body: bytes) -> None:
+    command, layout = _FORMS[kind]
+    text = b""
+    if kind == MessageKind.DECISION:
+        body, text = body[: layout.size], body[layout.size :]
     if len(body) != layout.size:
         raise FrameError(_WHERE, "length", len(body), f"{layout.size} bytes after the head")
+    values: Sequence[Any] = layout.unpack(body)
+    if kind == MessageKind.REGION:
+        values = values[0], _box(values[1]), values[2]
+    elif kind == MessageKind.PRIORITISE:
+        values = values[0], _named(_PLACES, "place", values[1])
+    elif kind == MessageKind.REVISIT:
+        values = [value / _DEGREE_STEPS for value in values]
+    elif kind == MessageKind.DECISION:
+        number, version, verdict, confidence = values
+        probability = None if confidence == _NO_CONFIDENCE else confidence / _CONFIDENCE_STEPS
+        values = number, version, _named(_VERDICTS, "verdict", verdict), probability, _class_name(text)
+    return command(token, issued, *values)
+
+
+def _named(names: Sequence[str], field: str, place: int) -> str:
+    if place >= len(names):
+        raise FrameError(_WHERE, field, place, f"0..{len(names) - 1}")
+    return names[place]
+
+
+def _class_name(text: bytes) -> str:
+    try:
+        return text.decode()
+    except UnicodeDecodeError as error:
+        raise FrameError(_WHERE, "mlo_class", text, "UTF-8") from error
+
+
+def _box(packed: bytes) -> RegionBox:
+    try:
+        return RegionBox.unpack(packed)
+    except BadInputError as error:
+        raise FrameError(_WHERE, "box", packed, error.expected) from error
 
 
 def _confirmation(body: bytes) -> ConfirmationMessage:
