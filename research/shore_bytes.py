@@ -20,8 +20,7 @@ from sonarpost.codec import encode
 from sonarpost.delivery.protocol import attachment
 from sonarpost.delivery.records import OutboxItem
 from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary
-from sonarpost.link.received_image import received_image
-from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.receiver import ImageUpdate, received_image
 from sonarpost.messages import ReceivedImage, Record, Relayed
 from sonarpost.sonar.survey import Side
 

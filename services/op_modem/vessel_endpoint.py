@@ -13,8 +13,7 @@ from sonarpost.link.downlink import messages as dl
 from sonarpost.link.downlink.commands import MAX_PENDING, CommandTracker, PendingCommand
 from sonarpost.link.downlink.vessel_endpoint import VesselEndpoint
 from sonarpost.link.frames.v1.frame import segments_room
-from sonarpost.link.received_image import received_image
-from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.receiver import ImageUpdate, received_image
 from sonarpost.link.state import Parts, below, prefixed
 from sonarpost.messages import Command, CommandKind, Decision, DownlinkState, ReceivedImage
 from sonarpost.services.op_modem.config import OpModemConfig

@@ -12,8 +12,7 @@ from sonarpost.archive import codebook_transfer
 from sonarpost.archive.decoder import Decoder
 from sonarpost.codec.registry import CodecResources, default_registry
 from sonarpost.codec.vq.codebook import open_codebook, to_bytes
-from sonarpost.link.received_image import received_image
-from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.receiver import ImageUpdate, received_image
 from sonarpost.messages import CodedImage, ReconstructedImage
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service

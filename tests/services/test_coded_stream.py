@@ -16,8 +16,7 @@ from sonarpost.codec.registry import default_registry
 from sonarpost.delivery.records import InboxItem, OutboxItem, Topic
 from sonarpost.delivery.transaction import UnitOfWork
 from sonarpost.link.downlink.messages import image_of_number
-from sonarpost.link.received_image import received_image
-from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.receiver import ImageUpdate, received_image
 from sonarpost.messages import CodedImage, ImagePart, ReconstructedImage, Relayed
 from sonarpost.services.c2.config import C2Config
 from sonarpost.services.c2.service import C2Service

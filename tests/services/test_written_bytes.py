@@ -10,8 +10,7 @@ from builders.vessel_frames import CONTACT, packet, preview_frame, received
 from sonarpost import keys, wire
 from sonarpost.delivery.store import Store
 from sonarpost.link.downlink.messages import image_of_number
-from sonarpost.link.received_image import received_image
-from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.receiver import ImageUpdate, received_image
 from sonarpost.messages import CodedImage, ReceivedImage
 from sonarpost.modem.interface import FrameDecoded
 from sonarpost.runtime.saved_endpoint import SavedEndpoint

@@ -15,9 +15,10 @@ import numpy as np
 from sonarpost.codec.interface import Mask, StreamHeader
 from sonarpost.errors import FrameError, StreamError
 from sonarpost.link.coding.byte_ranges import Ranges, covered_within, gaps_within
-from sonarpost.link.frames.contact_record import ContactSummary
+from sonarpost.link.frames.contact_record import ContactSummary, contact_of
 from sonarpost.link.frames.paper.frame import HalfName, half_bounds, parse_frame
 from sonarpost.link.frames.v1.payload_objects import Feedback, RefineRequest
+from sonarpost.messages import ReceivedImage
 
 WireFormat = Literal["v1", "paper"]
 
@@ -99,6 +100,46 @@ def received_mask(stream: bytes, missing: Ranges) -> Mask:
     for start, stop in missing:
         received[start:stop] = False
     return received[StreamHeader.unpack(stream).size :]
+
+
+def received_image(
+    update: ImageUpdate, vessel_id: str, vehicle_id: str, *, authenticated: bool | None = None
+) -> ReceivedImage:
+    """Return the record of an image's received content.
+
+    The link does not carry the detector's contact identifier: the record has vehicle and image identifier instead.
+
+    Args:
+        update: The content.
+        vessel_id: Name of the vessel.
+        vehicle_id: Name of the vehicle.
+        authenticated: Whether all frames of the image were authenticated; None if that is not known.
+
+    Raises:
+        ValidationError: A value does not fit the record.
+    """
+    summary = update.contact
+    contact = None if summary is None else contact_of(summary, vehicle_id, update.image_id)
+    return ReceivedImage(
+        vessel_id=vessel_id,
+        vehicle_id=vehicle_id,
+        image_id=update.image_id,
+        version=update.version,
+        contact=contact,
+        height_px=None if summary is None else summary.height_px,
+        width_px=None if summary is None else summary.width_px,
+        stream=update.stream,
+        missing=update.missing,
+        missing_halves=update.missing_halves,
+        complete=update.complete,
+        bytes_received=update.received_bytes,
+        bytes_total=update.total_bytes,
+        frames_received=update.frames,
+        conflicts=update.conflicts,
+        first_frame_utc_s=update.first_frame_s,
+        last_frame_utc_s=update.last_frame_s,
+        authenticated=authenticated,
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,7 @@ from sonarpost.extensions.satellite.short_message import (
     pack_decision,
 )
 from sonarpost.link.frames.contact_record import ContactSummary
-from sonarpost.link.received_image import received_image
-from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.receiver import ImageUpdate, received_image
 from sonarpost.messages import Decision, ReceivedImage
 from sonarpost.sonar.survey import Side
 

@@ -12,7 +12,7 @@ from sonarpost.link.config import SenderConfig
 from sonarpost.link.frames.contact_record import ContactSummary
 from sonarpost.link.frames.v1.receiver import V1Receiver
 from sonarpost.link.frames.v1.sender import V1Sender
-from sonarpost.link.received_image import received_image
+from sonarpost.link.receiver import received_image
 from sonarpost.modem.micromodem.rates import RATES
 from sonarpost.review.resolution import detail_px, sharp_to_m
 

@@ -28,8 +28,7 @@ from sonarpost.errors import CodebookError
 from sonarpost.link.frames.paper.frame import ContactFrame, parse_frame
 from sonarpost.link.frames.paper.receiver import PaperReceiver
 from sonarpost.link.frames.paper.sender import plan_packets
-from sonarpost.link.received_image import received_image
-from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.receiver import ImageUpdate, received_image
 from sonarpost.messages import ReconstructedImage
 from sonarpost.runtime import retention
 from sonarpost.services.decompressor.config import DecompressorConfig

@@ -5,8 +5,7 @@ from builders.common import eventually
 from builders.vessel_frames import packet
 
 from sonarpost import wire
-from sonarpost.link.received_image import received_image
-from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.receiver import ImageUpdate, received_image
 from sonarpost.messages import ReceivedImage
 from sonarpost.services.op_modem import image_limiter
 from sonarpost.services.op_modem.image_limiter import UNLISTED, ImageLimiter, decoded_pixels

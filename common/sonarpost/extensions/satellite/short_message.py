@@ -17,8 +17,7 @@ import msgpack
 from sonarpost.errors import BadInputError, PayloadError
 from sonarpost.link.frames.contact_record import RECORD_SIZE, ContactSummary, summary_of
 from sonarpost.link.frames.paper.frame import IMAGE_ID_COUNT, format_image_id
-from sonarpost.link.received_image import received_image
-from sonarpost.link.receiver import ImageUpdate
+from sonarpost.link.receiver import ImageUpdate, received_image
 from sonarpost.messages import Decision, ReceivedImage
 from sonarpost.wire import validated
 
