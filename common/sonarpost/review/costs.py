@@ -9,6 +9,8 @@ from functools import lru_cache
 from itertools import accumulate, product
 from typing import Final
 
+from scipy.special import bdtrc
+
 from sonarpost.modem.interface import RateInfo
 
 NEW_IMAGE_KINDS: Final = ("expand", "original")
@@ -167,7 +169,7 @@ def expected_arrival(cost: RequestCost, rate: RateInfo, overhead_bytes: int, lin
     )  # one more for confirmation, preview
     packets = math.ceil(needed / (1 - loss) / rate.frames)
     frames = packets * rate.frames
-    complete = 1.0 if loss == 0 else sum(_binomial(frames, n, 1 - loss) for n in range(needed, frames + 1))
+    complete = float(bdtrc(needed - 1, frames, 1 - loss))
     turn_s = _TURN_S + cost.downlink_s
     round_s = turn_s + _ANSWER_TURN_S + rate.airtime_s
     first_s = turn_s + _ANSWER_TURN_S + _CODING_S + packets * rate.airtime_s
@@ -184,9 +186,3 @@ def expected_arrival(cost: RequestCost, rate: RateInfo, overhead_bytes: int, lin
     factor = math.exp(sum(map(math.log, link.ratios)) / (len(link.ratios) + _PRIOR_REQUESTS))
     factor = min(max(factor, _FACTORS[0]), _FACTORS[1])
     return ExpectedArrival(factor * median_s, factor * most_s)
-
-
-def _binomial(trials: int, successes: int, share: float) -> float:
-    """Return the probability of a number of successes; `share` between 0 and 1. Long streams have many frames."""
-    ways = math.lgamma(trials + 1) - math.lgamma(successes + 1) - math.lgamma(trials - successes + 1)
-    return math.exp(ways + successes * math.log(share) + (trials - successes) * math.log1p(-share))
