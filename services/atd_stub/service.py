@@ -398,14 +398,10 @@ class AtdStubService(Service[AtdStubConfig]):
                 **counts,
             ),
         )
-        for contact_id in result.replaced:
-            log.info(
-                "Held contact released", extra=kv(contact_id=contact_id, reason=f"seen whole in {printable(path.name)}")
-            )
-        for contact_id in result.dropped:
-            reason = f"not detected in the pings joined with {printable(path.name)}"
-            log.info("Held contact dropped", extra=kv(contact_id=contact_id, reason=reason))
-        self._log_released(result.not_continued, f"not continued by {printable(path.name)}")
+        name = printable(path.name)
+        _log_contacts("Held contact released", result.replaced, f"seen whole in {name}")
+        _log_contacts("Held contact dropped", result.dropped, f"not detected in the pings joined with {name}")
+        _log_contacts("Held contact released", result.not_continued, f"not continued by {name}")
         for snippet in result.held:
             log.info(
                 "Contact held for continuation file",
@@ -451,11 +447,8 @@ class AtdStubService(Service[AtdStubConfig]):
         expired = self._file_ends.release_expired(effects, time.time(), self.config.join_timeout_s)
         if expired:
             self._commit_contacts(effects, expired)
-            self._log_released(expired, f"no continuation file within {self.config.join_timeout_s:g} s")
-
-    def _log_released(self, snippets: tuple[Snippet, ...], reason: str) -> None:
-        for snippet in snippets:
-            log.info("Held contact released", extra=kv(contact_id=snippet.contact.contact_id, reason=reason))
+            reason = f"no continuation file within {self.config.join_timeout_s:g} s"
+            _log_contacts("Held contact released", expired, reason)
 
     def _skip_known(self, file: InputFile, content: str, entry: Mapping[str, Any]) -> None:
         """Skip a file that was processed before; move one that was refused to the quarantine again."""
@@ -506,6 +499,11 @@ class AtdStubService(Service[AtdStubConfig]):
         used = {part for other in self._present if other.path != file.path for part in other.parts}
         inside = (part for part in file.others if part.is_relative_to(file.path.parent) and part not in used)
         return (file.path, *inside)
+
+
+def _log_contacts(event: str, snippets: tuple[Snippet, ...], reason: str) -> None:
+    for snippet in snippets:
+        log.info(event, extra=kv(contact_id=snippet.contact.contact_id, reason=reason))
 
 
 def _known_parts(path: Path) -> tuple[Path, ...]:

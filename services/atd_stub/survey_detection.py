@@ -57,8 +57,8 @@ class DetectionResult:
         joined: Whether the file continued the previous one.
         not_continued: Contacts held at the end of an earlier recording, which this file does not continue; ready for
             release too.
-        replaced: Identifiers of contacts held at the end of the previous file and detected again with this one.
-        dropped: Identifiers of contacts held there and not detected in the joined pings.
+        replaced: Contacts held at the end of the previous file and detected again with this one.
+        dropped: Contacts held there and not detected in the joined pings.
         warnings: Warnings of the reader.
         weaker: What lower thresholds would have given: the number of contacts, by confidence. Approximate at the
             boundaries of files and of strips.
@@ -74,8 +74,8 @@ class DetectionResult:
     held: tuple[Snippet, ...] = ()
     joined: bool = False
     not_continued: tuple[Snippet, ...] = ()
-    replaced: tuple[str, ...] = ()
-    dropped: tuple[str, ...] = ()
+    replaced: tuple[Snippet, ...] = ()
+    dropped: tuple[Snippet, ...] = ()
     warnings: tuple[str, ...] = ()
     weaker: Mapping[float, int] = field(default_factory=dict)
     masked_pings: int = 0
@@ -184,8 +184,8 @@ def _detect(
         held=() if at_once else snippets_of(found.held),
         joined=found.joined,
         not_continued=snippets_of(found.released),
-        replaced=tuple(snippet.contact.contact_id for snippet in snippets_of(found.replaced)),
-        dropped=tuple(snippet.contact.contact_id for snippet in snippets_of(found.dropped)),
+        replaced=snippets_of(found.replaced),
+        dropped=snippets_of(found.dropped),
         warnings=(*info.warnings, coarse) if masked.coarse_count else info.warnings,
         weaker=found.weaker,
         masked_pings=masked.masked_count,

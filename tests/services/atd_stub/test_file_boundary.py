@@ -190,7 +190,7 @@ def test_a_held_contact_that_the_joined_pings_do_not_confirm_is_dropped(tmp_path
     [held] = before.held
     strict = HOLDING.model_copy(update={"confidence_threshold": 2.0})
     result = detect_in_survey(second, "1" * 64, "uuv-1", strict, before.ends)
-    assert (result.dropped, result.snippets) == ((held.contact.contact_id,), ())
+    assert (result.dropped, result.snippets) == ((held,), ())
 
 
 @pytest.mark.parametrize("pings", [300, pytest.param(1700, marks=pytest.mark.system)])
