@@ -9,11 +9,10 @@ from typing import Final
 
 from sonarpost.codec.fitting import Fit, fit_image
 from sonarpost.errors import StreamError, SurveyFileError
-from sonarpost.files import write_atomically
 from sonarpost.messages import Contact, Pixels, Snippet
 from sonarpost.services.atd_stub.input_folder import printable
 from sonarpost.sonar.image_decoding import read_any_image
-from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX, tiff_bytes
+from sonarpost.sonar.image_files import SIDE_CAR_SUFFIX, write_tiff
 from sonarpost.sonar.side_car import SideCar, read_side_car, write_side_car
 
 SNIPPET_SUFFIXES: Final = (".txt", ".tiff")
@@ -31,7 +30,7 @@ def write_snippet(folder: Path, snippet: Snippet) -> Path:
     """
     folder.mkdir(parents=True, exist_ok=True)
     tiff = folder / f"{_UNSAFE_CHARACTER.sub('_', snippet.contact.contact_id)}.tiff"
-    write_atomically(tiff, tiff_bytes(tiff, snippet.pixels.to_array()))
+    write_tiff(tiff, snippet.pixels.to_array())
     write_side_car(tiff.with_suffix(SIDE_CAR_SUFFIX), snippet.contact)
     return tiff
 
