@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 import serial
-from builders.common import WAIT_S, eventually, free_port
+from builders.common import WAIT_S, eventually
 
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.runtime import serial_device, serial_port
@@ -162,20 +162,6 @@ def test_a_socket_is_opened_again_after_it_was_closed(server, reset):
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger_zero)
             connection.close()
             assert isinstance(events.next(), PortLost)
-    finally:
-        port.close()
-
-
-def test_an_absent_server_is_retried(caplog):
-    number = free_port()
-    port = SerialPort(f"socket://127.0.0.1:{number}")
-    events = PortEvents(port)
-    try:
-        eventually(lambda: port.error is not None)
-        assert "refused" in (port.error or "")
-        with socket.create_server(("127.0.0.1", number)):
-            assert events.next() == PortOpened()
-        assert sum("cannot be opened" in record.getMessage() for record in caplog.records) == 1
     finally:
         port.close()
 
