@@ -75,8 +75,8 @@ class ServiceRunner:
         self._running: list[Service[Any]] = []
 
     def start(self, service):
+        self._running.append(service)  # stopped at the end also if its start fails
         assert service.start()
-        self._running.append(service)
         return service
 
     def stop(self, service):
