@@ -253,13 +253,13 @@ def model_tag(codec_id: int, model_hash: str) -> int:
     return int(model_hash[: 2 * tag_length(codec_id)] or "0", 16)
 
 
-def check_image(image: npt.NDArray[np.generic], where: str = "image") -> None:
+def check_image(image: npt.NDArray[np.generic]) -> None:
     """Raise StreamError unless `image` is two-dimensional, uint8 or uint16, with sides of 16..512 px."""
     if image.ndim != 2:
-        raise StreamError(where, "shape", image.shape, "two dimensions (height, width)")
+        raise StreamError("image", "shape", image.shape, "two dimensions (height, width)")
     if image.dtype not in (np.dtype(np.uint8), np.dtype(np.uint16)):
-        raise StreamError(where, "dtype", str(image.dtype), "uint8 or uint16")
-    _check_sides(where, *image.shape)
+        raise StreamError("image", "dtype", str(image.dtype), "uint8 or uint16")
+    _check_sides("image", *image.shape)
 
 
 def _check_sides(where: str, height_px: int, width_px: int) -> None:

@@ -115,14 +115,14 @@ def network() -> tuple[Convolution, ...]:
         )
 
 
-def check_strength(strength: float, where: str = "codec emb") -> float:
+def check_strength(strength: float) -> float:
     """Return the multiple of 1/16 next to a strength; at least 1/16 if the strength is not 0.
 
     Raises:
         ConfigError: It is outside 0..1 or not a number.
     """
     if not 0 <= strength <= 1:
-        raise ConfigError(where, "strength", strength, "0..1")
+        raise ConfigError("codec emb", "strength", strength, "0..1")
     return max(round(strength * STRENGTH_STEPS), int(strength > 0)) / STRENGTH_STEPS
 
 

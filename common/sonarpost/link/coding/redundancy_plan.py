@@ -25,6 +25,7 @@ Counts = npt.NDArray[np.int64]
 
 _STEPS: Final = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 26, 34, 44, 63)
 _FIRST_TRIES: Final = 24
+_MAX_COPIES: Final = 8
 _SURE: Final = 0.999
 
 
@@ -218,11 +219,11 @@ def arrivals(frames: int, channels: Sequence[LossChannel], depth: int) -> Values
     return mean
 
 
-def copies(channel: LossChannel, missed: float = 0.01, limit: int = 8) -> int:
+def copies(channel: LossChannel, missed: float = 0.01) -> int:
     """Return how many copies of a frame to send so that all are lost with a probability of at most `missed`."""
     if channel.loss <= missed:
         return 1
-    return min(limit, math.ceil(math.log(missed) / math.log(channel.loss)))
+    return min(_MAX_COPIES, math.ceil(math.log(missed) / math.log(channel.loss)))
 
 
 def symbols_to_send(missing_symbols: int, channel: LossChannel, caution: float | None = None) -> int:

@@ -373,11 +373,9 @@ def _confirmation(body: bytes) -> ConfirmationMessage:
     return ConfirmationMessage(tuple(found))
 
 
-def confirmations(
-    outcomes: Sequence[tuple[int, CommandOutcome]], room_bytes: int = SMALLEST_ROOM_BYTES
-) -> tuple[ConfirmationMessage, ...]:
-    """Return outcomes as messages of at most `room_bytes` each, as few as possible."""
-    each = max(1, (room_bytes - 1) // _OUTCOME.size)
+def confirmations(outcomes: Sequence[tuple[int, CommandOutcome]]) -> tuple[ConfirmationMessage, ...]:
+    """Return outcomes as messages of at most `SMALLEST_ROOM_BYTES` each, as few as possible."""
+    each = (SMALLEST_ROOM_BYTES - 1) // _OUTCOME.size
     return tuple(ConfirmationMessage(tuple(outcomes[at : at + each])) for at in range(0, len(outcomes), each))
 
 
