@@ -57,6 +57,10 @@ def test_distances_closer_than_single_precision_are_distinguished() -> None:
     check(stored, stored[:50] + 1, 8)
 
 
+def test_many_equal_vectors_are_compared_in_parts() -> None:
+    check(np.zeros((20_000, 3), np.int32), np.zeros((5, 3), np.int32), 8)
+
+
 def test_search_in_the_shipped_codebook_is_exact() -> None:
     database = load_default(10).tiles
     rng = np.random.default_rng(2)

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 GROUP = 32  # scores of which only the least is sorted
+_PAIRS = 65_536  # compared exactly at a time, to limit the memory if many vectors are equal
 _EMPTY = np.float32(1e30)  # squared norm of an empty place; others stay below 2e15
 
 Indices = npt.NDArray[np.int64]
@@ -71,8 +72,11 @@ class NearestSearch:
         query, number = np.repeat(query, GROUP), (group[:, None] + groups * np.arange(GROUP)).ravel()
         is_near = scores[query, number] <= limits[query]
         query, number = query[is_near], number[is_near]
-        products = np.einsum("ij,ij->i", queries[query], self.vectors[number].astype(np.float64))
-        exact = self.norms[number] - 2.0 * products
+        exact = self.norms[number]
+        for start in range(0, len(exact), _PAIRS):
+            part = slice(start, start + _PAIRS)
+            near = self.vectors[number[part]].astype(np.float64)
+            exact[part] -= 2.0 * np.einsum("ij,ij->i", queries[query[part]], near)
         order = np.lexsort((number, exact, query))
         first = np.searchsorted(query[order], np.arange(len(queries)))
         chosen = order[first[:, None] + np.arange(count)]
