@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from sonarpost.archive.backlog import Backlog, BacklogRecord
-from sonarpost.archive.decode_worker import Decoded, DecodedImage, DecodeWorker
+from sonarpost.archive.decode_worker import Decoded, DecodeWorker, PackedImage
 from sonarpost.delivery.store import Store
 from sonarpost.errors import DeliveryError, can_concern_record
 from sonarpost.limits import Turns, limit
@@ -149,7 +149,7 @@ class Decoding:
         store: Store,
         backlog: Callable[[], Backlog],
         workers: Sequence[DecodeWorker],
-        keep: Callable[[Sequence[DecodedImage], Sequence[BacklogRecord]], None],
+        keep: Callable[[Sequence[PackedImage], Sequence[BacklogRecord]], None],
         on_undecodable: Callable[[BacklogRecord, str], None],
         stopping: threading.Event,
     ) -> None:
@@ -253,7 +253,7 @@ class Decoding:
             return
         is_alone = len(batch) == 1
         failed: dict[str, float] = {}
-        decoded: list[tuple[BacklogRecord, DecodedImage]] = []
+        decoded: list[tuple[BacklogRecord, PackedImage]] = []
         for entry, (result, taken_s) in zip(batch, results, strict=True):
             if result.image is not None:
                 decoded.append((entry, result.image))
@@ -287,7 +287,7 @@ class Decoding:
             self._idle.append(worker)
         return result, time.monotonic() - started_s
 
-    def _keep_parts(self, group: Sequence[tuple[BacklogRecord, DecodedImage]], *, is_alone: bool) -> set[str]:
+    def _keep_parts(self, group: Sequence[tuple[BacklogRecord, PackedImage]], *, is_alone: bool) -> set[str]:
         """Store images, after a failure in halves; return the vessels of those that cannot be stored."""
         entries = [entry for entry, _ in group]
         try:
@@ -333,10 +333,10 @@ class Decoding:
 
 
 def _groups(
-    decoded: Sequence[tuple[BacklogRecord, DecodedImage]],
-) -> Iterator[list[tuple[BacklogRecord, DecodedImage]]]:
+    decoded: Sequence[tuple[BacklogRecord, PackedImage]],
+) -> Iterator[list[tuple[BacklogRecord, PackedImage]]]:
     """Yield images in groups of at most `BATCH_BYTES` of pixels, at least one each."""
-    group: list[tuple[BacklogRecord, DecodedImage]] = []
+    group: list[tuple[BacklogRecord, PackedImage]] = []
     size_bytes = 0
     for each in decoded:
         size_bytes += len(each[1].record.pixels.data)

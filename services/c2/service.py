@@ -16,7 +16,7 @@ from sonarpost import keys, wire
 from sonarpost.archive import image_parts
 from sonarpost.archive.backlog import BacklogRecord
 from sonarpost.archive.codebook_transfer import CodebookFetcher
-from sonarpost.archive.decode_worker import DecodedImage, DecodeWorker
+from sonarpost.archive.decode_worker import DecodeWorker, PackedImage
 from sonarpost.archive.decoder import OTHER_PIXELS
 from sonarpost.archive.journal import Accepted, JournalEntry
 from sonarpost.bus.connectivity import declare_presence
@@ -252,7 +252,7 @@ class C2Service(Service[C2Config]):
         self._archive.queue_image(key, effects.payload, image)
         effects.count("images_accepted")
 
-    def _keep_images(self, images: Sequence[DecodedImage], entries: Sequence[BacklogRecord]) -> None:
+    def _keep_images(self, images: Sequence[PackedImage], entries: Sequence[BacklogRecord]) -> None:
         """Store and publish decoded images of entries of the backlog.
 
         Raises:

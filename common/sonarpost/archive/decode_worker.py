@@ -48,8 +48,8 @@ _MACHINE: Final = frozenset({EXIT_MACHINE, -signal.SIGKILL, -signal.SIGTERM, -si
 _LENGTH = struct.Struct(">I")
 
 
-class DecodedImage(NamedTuple):
-    """A decoded image with its payload; empty if that is not known."""
+class PackedImage(NamedTuple):
+    """A decoded image and its payload, which is empty if it is not known."""
 
     record: ReconstructedImage
     payload: bytes = b""
@@ -67,7 +67,7 @@ class Decoded:
             exceeded its processor time; else empty.
     """
 
-    image: DecodedImage | None = None
+    image: PackedImage | None = None
     reason: str = ""
     missing_model: str = ""
     failure: Literal["", "machine", "crash"] = ""
@@ -142,7 +142,7 @@ class DecodeWorker:
         if "payload" not in fields:
             return Decoded(reason=fields["reason"], missing_model=fields["model"])
         payload = fields["payload"]
-        return Decoded(DecodedImage(wire.decode(ReconstructedImage, payload, f"image of {vessel_id}"), payload))
+        return Decoded(PackedImage(wire.decode(ReconstructedImage, payload, f"image of {vessel_id}"), payload))
 
     def _ended(self, status: int, *, is_ready: bool) -> Decoded:
         if not is_ready:

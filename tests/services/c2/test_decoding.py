@@ -13,7 +13,7 @@ from builders.common import eventually
 from sonarpost import keys, wire
 from sonarpost.archive import decode_worker
 from sonarpost.archive.backlog import BacklogRecord
-from sonarpost.archive.decode_worker import Decoded, DecodedImage, DecodeWorker, coded_image
+from sonarpost.archive.decode_worker import Decoded, DecodeWorker, PackedImage, coded_image
 from sonarpost.archive.decoder import Decoder
 from sonarpost.archive.reader import open_archive
 from sonarpost.archive.shore_archive import Batch
@@ -61,7 +61,7 @@ class Backlog:
         name = f"{image.vessel_id}/{image.image_id}"
         self.tried.append(name)
         self.faults.add(self.decoding.fault)
-        return self.failing(name) or Decoded(DecodedImage(self._decoder.decode(image)))
+        return self.failing(name) or Decoded(PackedImage(self._decoder.decode(image)))
 
     def _keep(self, images, entries):
         for image, _ in images:
