@@ -49,7 +49,7 @@ _ENDPOINT = re.compile(
 )
 _LOOPBACK = re.compile(r"localhost|127\.[0-9.]+|\[::1\]")
 
-Json = dict[str, object]
+_Json = dict[str, object]
 AccessRule = tuple[Literal["ingress", "egress"], tuple[str, ...], tuple[str, ...]]
 """Something that is allowed: flow, kinds of Zenoh messages, key expressions."""
 
@@ -103,8 +103,8 @@ def router_json5(index: FleetIndex, options: RouterOptions, now_utc_s: float) ->
     return "\n".join(head) + "\n" + json.dumps(_settings(index, entry, options), indent=2) + "\n"
 
 
-def _settings(index: FleetIndex, router: CertificateEntry, options: RouterOptions) -> Json:
-    tls: Json = {
+def _settings(index: FleetIndex, router: CertificateEntry, options: RouterOptions) -> _Json:
+    tls: _Json = {
         "enable_mtls": True,
         "verify_name_on_connect": True,
         "close_link_on_expiration": True,
@@ -154,7 +154,7 @@ def _settings(index: FleetIndex, router: CertificateEntry, options: RouterOption
     }
 
 
-def _thinned_health(router: CertificateEntry) -> list[Json]:
+def _thinned_health(router: CertificateEntry) -> list[_Json]:
     """Return Zenoh's `downsampling` section: health of a vessel's services on its way to other platforms.
 
     Zenoh keeps one time for each rule: with a wildcard, the report of one service would cause the reports of all others
@@ -174,13 +174,13 @@ def _thinned_health(router: CertificateEntry) -> list[Json]:
     ]
 
 
-def dropped_replies() -> Json:
+def dropped_replies() -> _Json:
     """Return Zenoh's `qos` section: replies of c2 are dropped for a client that does not read them.
 
     A reply has the congestion control of its query. With that of a query to c2 set to drop, a client that stops reading
     cannot block the router. Replies are numbered and counted, so that the client notices a gap.
     """
-    overwrite: Json = {
+    overwrite: _Json = {
         "id": "queries for stored records",
         "messages": ["query"],
         "key_exprs": [keys.shore_contact_everywhere(), keys.tasking_state_everywhere()],
@@ -211,7 +211,7 @@ def _check_endpoints(options: RouterOptions) -> None:
 # Access control
 
 
-def _access_control(index: FleetIndex, router: CertificateEntry, options: RouterOptions) -> Json:
+def _access_control(index: FleetIndex, router: CertificateEntry, options: RouterOptions) -> _Json:
     """Return Zenoh's `access_control` section: the platform's own services, all admitted names.
 
     Raises:
@@ -222,10 +222,10 @@ def _access_control(index: FleetIndex, router: CertificateEntry, options: Router
     everywhere = (keys.ANY, keys.ROUTER_ADMINISTRATION)
     local: list[AccessRule] = [("ingress", EVERY_MESSAGE, everywhere), ("egress", EVERY_MESSAGE, everywhere)]
     # The own services connect by plain TCP, to an address that no other program can reach.
-    grants: list[tuple[str, Json, list[AccessRule]]] = [("local services", {"link_protocols": ["tcp"]}, local)]
+    grants: list[tuple[str, _Json, list[AccessRule]]] = [("local services", {"link_protocols": ["tcp"]}, local)]
     for entry in (entry for role in PEER_ROLES[router.role] for entry in index.allowed(role)):
         if entry.platform != router.platform:
-            peer: Json = {"cert_common_names": [entry.common_name], "link_protocols": ["tls"]}
+            peer: _Json = {"cert_common_names": [entry.common_name], "link_protocols": ["tls"]}
             at_shore = router.role == "shore"
             rules = (
                 _rules_at_shore(entry, options.sites)
@@ -238,7 +238,7 @@ def _access_control(index: FleetIndex, router: CertificateEntry, options: Router
         if not entries:
             raise PkiError("router-config", "vessel", name, "another vessel of the fleet with a certificate")
         for entry in entries:
-            named_vessel: Json = {"cert_common_names": [entry.common_name], "link_protocols": ["tls"]}
+            named_vessel: _Json = {"cert_common_names": [entry.common_name], "link_protocols": ["tls"]}
             grants.append((f"vessel {entry.common_name}", named_vessel, rules))
     named = [(subject, number, rule) for subject, _, rules in grants for number, rule in enumerate(rules, start=1)]
     return {

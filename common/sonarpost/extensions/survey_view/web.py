@@ -34,7 +34,7 @@ from sonarpost.wire import first_error
 STATIC: Final = Path(__file__).parent / "static"
 MAX_BODY_BYTES: Final = 1 << 16
 
-Json: TypeAlias = dict[str, object]
+_Json: TypeAlias = dict[str, object]
 
 
 class SavedPicks(BaseModel):
@@ -141,7 +141,7 @@ class SurveyViewApp:
             }
         )
 
-    def _pick_json(self, pick: Pick, ping_index: int) -> Json:
+    def _pick_json(self, pick: Pick, ping_index: int) -> _Json:
         row, column = self._waterfall.pixel(ping_index, pick.side, pick.sample)
         return {"pick": str(pick), "row": row, "column": column}
 
@@ -150,7 +150,7 @@ class SurveyViewApp:
             state, message, detections = self._contacts.state, self._contacts.message, self._contacts.detections
         return JSONResponse({"state": state, "message": message, "contacts": list(map(self._contact_json, detections))})
 
-    def _contact_json(self, d: Detection) -> Json:
+    def _contact_json(self, d: Detection) -> _Json:
         waterfall = self._waterfall
         near_m = d.highlight_samples[0] * d.pixel_across_m
         far_m = (d.highlight_samples[1] + d.shadow_samples) * d.pixel_across_m
@@ -212,7 +212,7 @@ class SurveyViewApp:
         return self._waterfall.ping_index_of(pick) if known is None else known
 
 
-def _place_json(place: PixelPlace) -> Json:
+def _place_json(place: PixelPlace) -> _Json:
     fields = asdict(place)
     return (
         fields
