@@ -548,7 +548,11 @@ def _identities(file: InputFile) -> _Identities:
 
 
 def _is_unchanged(file: InputFile, before: _Identities) -> bool:
-    """Return whether the files exist and have not been replaced or written."""
+    """Return whether the files exist and have not been replaced or written.
+
+    Raises:
+        OSError: One cannot be examined.
+    """
     try:
         return _identities(file) == before
     except FileNotFoundError:

@@ -14,7 +14,7 @@ from sonarpost.codec.machine_code import prepare_machine_code
 def add_options(parser: CommandParser) -> None:
     """Add the command."""
     parser.description = (
-        "Compiles the machine code of the codecs emb and vq and stores it on disk, so that the first image "
+        "Compiles the machine code of the codec emb and stores it on disk, so that the first image "
         "does not wait for the compiler. Run it once for each installation."
     )
     parser.set_defaults(run=run)

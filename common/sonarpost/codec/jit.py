@@ -20,7 +20,7 @@ from sonarpost.codec import compiled_library
 P = ParamSpec("P")
 R = TypeVar("R")
 
-COMPILE_S: Final = {"emb": 10, "vq": 2}
+COMPILE_S: Final = {"emb": 10}
 """Approximate time to compile all functions of a codec."""
 
 NO_FOLDER: Final = "no folder for it is writable; set NUMBA_CACHE_DIR or run `sonarpost prepare` as the installing user"
@@ -48,7 +48,7 @@ def use_code_folder(state_dir: Path) -> None:
         service_folders.append(folder)
 
 
-def jit(function: Callable[P, R], *, reorder_sums: bool = False) -> Callable[P, R]:
+def jit(function: Callable[P, R]) -> Callable[P, R]:
     """Return `function`, compiled on its first call.
 
     Each combination of argument types is compiled separately, and each function again within its callers. Literal
@@ -56,16 +56,14 @@ def jit(function: Callable[P, R], *, reorder_sums: bool = False) -> Callable[P, 
     raise an exception.
 
     A cached function is compiled again when a module with compiled functions in the same folder changes. Compiled
-    functions therefore use only functions and constants of such modules. With `reorder_sums`, the compiler may reorder
-    sums of floating-point numbers.
+    functions therefore use only functions and constants of such modules.
 
     Raises:
         ModuleNotFoundError: Neither numba nor the compiled library is installed.
     """
     if compiled_library.is_needed():
         return cast(Callable[P, R], compiled_library.library_function(function))
-    flags = {"reassoc", "contract", "nnan", "nsz"} if reorder_sums else False
-    compiled = _numba().njit(fastmath=flags, error_model="numpy", no_cfunc_wrapper=True)(function)
+    compiled = _numba().njit(error_model="numpy", no_cfunc_wrapper=True)(function)
     # numba has no public way to choose the cache; the attribute has had this name since 2016.
     compiled._cache = importlib.import_module("sonarpost.codec.code_cache").CodeCache(function)  # noqa: SLF001
     compiled_functions.append(compiled)

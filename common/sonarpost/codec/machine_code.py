@@ -8,11 +8,10 @@ import numpy as np
 
 from sonarpost.codec.interface import Codec, ExtensibleCodec, Image
 from sonarpost.codec.registry import CodecResources, default_registry
-from sonarpost.codec.vq.codebook import load_default
 
 
 def prepare_machine_code(progress: Callable[[str], None] | None = None) -> None:
-    """Compile all functions of emb and vq that are not in the cache on disk; `jit.compilation_log` counts them.
+    """Compile all functions of emb that are not in the cache on disk; `jit.compilation_log` counts them.
 
     Folders: see `code_cache.code_folders`.
 
@@ -20,14 +19,10 @@ def prepare_machine_code(progress: Callable[[str], None] | None = None) -> None:
         progress: Called with the name of each step before it starts.
     """
     registry = default_registry()
-    for name, resources in (
-        ("emb, model standard", CodecResources(model="standard")),
-        ("emb, model structure", CodecResources(model="structure")),
-        ("vq", CodecResources(load_default(10).tiles)),
-    ):
+    for model in ("standard", "structure"):
         if progress is not None:
-            progress(name)
-        _run_all_paths(registry.create(name.partition(",")[0], resources))
+            progress(f"emb, model {model}")
+        _run_all_paths(registry.create("emb", CodecResources(model=model)))
 
 
 def _run_all_paths(codec: Codec) -> None:
