@@ -7,7 +7,7 @@ handle them.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, Final, TypeVar
@@ -20,6 +20,20 @@ from sonarpost.archive.schema import BACKLOG, MEMBER
 CHUNK: Final = 500
 """Keys of one statement."""
 T = TypeVar("T")
+
+
+_B: Final = BACKLOG.c
+_IS_WAITING: Final = sa.and_(_B.owner == sa.bindparam("owner"), _B.is_coded)
+_WAITING_VESSELS: Final = sa.select(_B.vessel_id).distinct().where(_IS_WAITING)
+_WAITING_COUNT: Final = sa.select(sa.func.count()).where(_IS_WAITING)
+_WAITING: Final = sa.select(_B.key, _B.payload, _B.vessel_id, _B.id).where(_IS_WAITING)
+_WAITING_OF: Final = (
+    _WAITING.where(_B.vessel_id == sa.bindparam("vessel"), _B.id > sa.bindparam("after"))
+    .order_by(_B.id)
+    .limit(sa.bindparam("limit"))
+)
+_WAITING_RECORD: Final = _WAITING.where(_B.id == sa.bindparam("id"))
+_DELETE: Final = sa.delete(BACKLOG).where(sa.tuple_(_B.sha256, _B.key).in_(sa.bindparam("keys", expanding=True)))
 
 
 def chunks(keys: Sequence[T]) -> Iterable[list[T]]:
@@ -95,32 +109,25 @@ class Backlog:
 
     def waiting(self, vessel_id: str, after: int, limit: int) -> list[BacklogRecord]:
         """Return coded images of a vessel that wait for the decoder of this c2, in the order of acceptance."""
-        chosen = self._waiting().where(BACKLOG.c.vessel_id == vessel_id, BACKLOG.c.id > after)
-        return self._read(chosen.order_by(BACKLOG.c.id).limit(limit))
+        return self._read(_WAITING_OF, {"vessel": vessel_id, "after": after, "limit": limit})
 
     def waiting_vessels(self) -> list[str]:
         """Return the vessels whose coded images wait for the decoder of this c2."""
-        chosen = sa.select(BACKLOG.c.vessel_id).distinct().where(BACKLOG.c.owner == self._owner, BACKLOG.c.is_coded)
         with self._database.transaction(writing=False) as sql:
-            return sorted(sql.execute(chosen).scalars())
+            return sorted(sql.execute(_WAITING_VESSELS, {"owner": self._owner}).scalars())
 
     def waiting_record(self, id_: int) -> BacklogRecord | None:
         """Return a coded image that waits for the decoder; None if it does not."""
-        found = self._read(self._waiting().where(BACKLOG.c.id == id_))
+        found = self._read(_WAITING_RECORD, {"id": id_})
         return found[0] if found else None
 
     def count_waiting(self, sql: sa.Connection) -> None:
         """Set `waiting_count` in an open transaction."""
-        chosen = sa.select(sa.func.count()).where(BACKLOG.c.owner == self._owner, BACKLOG.c.is_coded)
-        self.waiting_count = int(sql.execute(chosen).scalar_one())
+        self.waiting_count = int(sql.execute(_WAITING_COUNT, {"owner": self._owner}).scalar_one())
 
-    def _waiting(self) -> sa.Select[Any]:
-        b = BACKLOG.c
-        return sa.select(b.key, b.payload, b.vessel_id, b.id).where(b.owner == self._owner, b.is_coded)
-
-    def _read(self, chosen: sa.Select[Any]) -> list[BacklogRecord]:
+    def _read(self, chosen: sa.Select[Any], values: Mapping[str, object]) -> list[BacklogRecord]:
         with self._database.transaction(writing=False) as sql:
-            return [BacklogRecord(*row) for row in sql.execute(chosen)]
+            return [BacklogRecord(*row) for row in sql.execute(chosen, {"owner": self._owner, **values})]
 
     def _values(self, sql: sa.Connection, records: Sequence[BacklogRecord]) -> list[dict[str, Any]]:
         now_utc_s = self._database.now_utc_s(sql)
@@ -140,9 +147,8 @@ class Backlog:
 
     def delete(self, sql: sa.Connection, records: Sequence[BacklogRecord]) -> None:
         """Delete records in an open transaction."""
-        keys = sa.tuple_(BACKLOG.c.sha256, BACKLOG.c.key)
         for part in chunks([(record.sha256, record.key) for record in records]):
-            sql.execute(sa.delete(BACKLOG).where(keys.in_(part)))
+            sql.execute(_DELETE, {"keys": part})
 
     def take_over(
         self, age_s: float, limit: int, limit_bytes: int, store: Callable[[list[BacklogRecord]], None]

@@ -191,7 +191,12 @@ class SqliteDatabase(ShoreDatabase):
         self._lock = threading.RLock()
         # One connection for each thread that reads at the same time; those that write wait for the lock.
         engine = sa.create_engine(
-            "sqlite://", creator=self._connect, poolclass=sa.QueuePool, pool_size=4, max_overflow=-1
+            "sqlite://",
+            creator=self._connect,
+            poolclass=sa.QueuePool,
+            pool_size=4,
+            max_overflow=-1,
+            pool_reset_on_return=None,  # `begin` ends every transaction
         )
         super().__init__(str(self.path), engine, site=site, writable=writable)
 

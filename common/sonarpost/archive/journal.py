@@ -173,6 +173,7 @@ class Journal:
         self._database = database
         key = (REVIEW.c.vessel_id, REVIEW.c.vehicle_id, REVIEW.c.image_id)
         insert = database.insert(REVIEW)
+        self._put_records = database.insert(RECORD)
         self._put_state = insert.on_conflict_do_update(index_elements=key, set_={"state": insert.excluded.state})
 
     # For queries
@@ -255,7 +256,7 @@ class Journal:
             by_digest[digest] = by_name[name] = found
             accepted.append(Accepted(identity, *found))
         if new:
-            self._database.put(sql, self._database.insert(RECORD), new)
+            self._database.put(sql, self._put_records, new)
             sql.execute(_SET_LAST, {"last": last})
             decided = {(r["vessel_id"], r["vehicle_id"], r["image_id"]) for r in new if r["encoding"] == _DECISION}
             if decided:

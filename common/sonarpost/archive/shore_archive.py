@@ -279,28 +279,23 @@ class ShoreArchive:
 
     def oldest_utc_s(self) -> float | None:
         """Return when the oldest image that is not removed was accepted; None if there is none."""
-        return self._number(sa.select(sa.func.min(IMAGE.c.accepted_utc_s)).where(IMAGE.c.removed_utc_s.is_(None)))
+        with self.database.transaction(writing=False) as sql:
+            oldest: float | None = sql.execute(_OLDEST).scalar_one()
+        return oldest
 
     def size_bytes(self) -> int:
         """Return the size of all images that are not removed, in bytes."""
-        size = sa.select(sa.func.sum(IMAGE.c.size_bytes)).where(IMAGE.c.removed_utc_s.is_(None))
-        return int(self._number(size) or 0)
-
-    def _number(self, chosen: sa.Select[Any]) -> float | None:
         with self.database.transaction(writing=False) as sql:
-            value: float | None = sql.execute(chosen).scalar_one()
-        return value
+            return int(sql.execute(_SIZE).scalar_one() or 0)
 
     def defect_counts(self) -> dict[str, int]:
         """Return the numbers of missing, changed, unreadable and conflicting images and decisions."""
         counts = dict.fromkeys(DEFECTS, 0)
-        conflicts = sa.select(sa.func.count()).where(IMAGE.c.conflict, IMAGE.c.removed_utc_s.is_(None))
         with self.database.transaction(writing=False) as sql:
-            for table, where in ((IMAGE, IMAGE.c.removed_utc_s.is_(None)), (DECISION, sa.true())):
-                faults = sa.select(table.c.fault, sa.func.count()).where(table.c.fault != "", where)
-                for fault, count in sql.execute(faults.group_by(table.c.fault)):
+            for faults in _FAULTS:
+                for fault, count in sql.execute(faults):
                     counts[fault] += count
-            counts["conflicting"] = sql.execute(conflicts).scalar_one()
+            counts["conflicting"] = sql.execute(_CONFLICTS).scalar_one()
         return counts
 
     def verify(self, now_utc_s: float, interval_s: float, cycle_s: float) -> list[Verified]:
@@ -404,9 +399,15 @@ def _named(table: sa.Table) -> sa.ColumnElement[bool]:
     return sa.tuple_(table.c.vessel_id, table.c.name).in_(sa.bindparam("names", expanding=True))
 
 
-_FIND_IMAGE: Final = sa.select(IMAGE.c.files_sha256, IMAGE.c.removed_utc_s.is_(None) & (IMAGE.c.fault == "")).where(
-    _is_image(IMAGE)
+_IS_KEPT: Final = IMAGE.c.removed_utc_s.is_(None)
+_OLDEST: Final = sa.select(sa.func.min(IMAGE.c.accepted_utc_s)).where(_IS_KEPT)
+_SIZE: Final = sa.select(sa.func.sum(IMAGE.c.size_bytes)).where(_IS_KEPT)
+_CONFLICTS: Final = sa.select(sa.func.count()).where(IMAGE.c.conflict, _IS_KEPT)
+_FAULTS: Final = tuple(
+    sa.select(table.c.fault, sa.func.count()).where(table.c.fault != "", kept).group_by(table.c.fault)
+    for table, kept in ((IMAGE, _IS_KEPT), (DECISION, sa.true()))
 )
+_FIND_IMAGE: Final = sa.select(IMAGE.c.files_sha256, _IS_KEPT & (IMAGE.c.fault == "")).where(_is_image(IMAGE))
 _FIND_DECISION: Final = sa.select(DECISION.c.files_sha256).where(
     DECISION.c.vessel_id == sa.bindparam("vessel"), DECISION.c.decision_id == sa.bindparam("decision")
 )

@@ -98,6 +98,8 @@ def side_car(image: ReconstructedImage) -> dict[str, object]:
 
 
 def _runs_of(mask: bytes) -> str:
+    if not mask:
+        return ""
     values = np.frombuffer(mask, dtype=np.uint8)
     is_start = (np.arange(values.size) % _RUN_BYTES == 0) | (np.diff(values, prepend=np.uint8(0)) != 0)
     starts = np.flatnonzero(is_start)
