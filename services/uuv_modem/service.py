@@ -57,9 +57,9 @@ _STATE_INTERVAL_S: Final = 0.2
 class UuvModemService(Service[UuvModemConfig]):
     """The vehicle's end of the acoustic link.
 
-    `handle` adds a record to the transmit queue. The transaction that accepts the record, or removes it from the inbox,
-    also writes the queue. The link's thread sends the packets. It commits each before it is sent, together with the end
-    of the one before: a restart sends at most one packet twice.
+    `handle` adds a record to the transmit queue. The transaction that removes the record from the inbox also writes the
+    queue. The link's thread sends the packets. It commits each before it is sent, together with the end of the one
+    before: a restart sends at most one packet twice.
 
     Attributes:
         modem: The modem.
@@ -69,7 +69,7 @@ class UuvModemService(Service[UuvModemConfig]):
     """
 
     NAME = "uuv_modem"
-    BATCH = MAX_AT_ONCE = 64
+    BATCH = 64
     PAGE_BYTES = 512
 
     def __init__(self, platform: PlatformConfig, config: UuvModemConfig) -> None:

@@ -4,7 +4,8 @@ import pytest
 import zenoh
 from builders.delivery_machine import Network, SteppedSender
 
-from sonarpost.delivery import queue_sender
+from sonarpost.delivery import outbox, queue_sender
+from sonarpost.delivery.outbox import Outbox
 from sonarpost.delivery.protocol import MAX_BATCH_RECORDS, AckReply
 from sonarpost.delivery.records import Topic
 from sonarpost.errors import DeliveryError
@@ -161,3 +162,36 @@ def test_a_new_record_is_loaded_at_once_only_if_its_place_is_among_those_in_memo
     assert loaded_after(b"edition of the last", topic=Topic("image-499", 2)) == (0, False)
     assert loaded_after(b"edition of an early one", topic=Topic("image-100", 2)) == (1, True)
     assert loaded_after(b"urgent", topic=None, priority=1) == (1, True)
+
+
+class StartedSender:
+    """A sender of an outbox whose first start fails, as without memory for another thread."""
+
+    restored = False
+
+    def __init__(self, made, *_arguments):
+        self.places = []
+        made.append(self)
+        if len(made) == 1:
+            raise RuntimeError("can't start new thread")
+
+    def on_new(self, place):
+        self.places.append(place)
+
+    def close(self):
+        """Nothing to end."""
+
+
+def test_sender_that_cannot_start_fails_no_commit(store, network, monkeypatch, caplog):
+    made = []
+    monkeypatch.setattr(outbox, "QueueSender", lambda *arguments: StartedSender(made, *arguments))
+    sending = Outbox(network, store)
+    with store.transaction() as tx:
+        tx.send("k", "c", b"first", encoding="e")
+        tx.accept("other/key", b"to handle")
+    assert (store.outbox_depth(), store.inbox_changed.is_set(), len(made)) == (1, True, 1)
+    assert "Sender not started" in caplog.text
+    queue(store, 1)
+    assert len(made) == 2
+    assert len(made[1].places) == 1
+    sending.close()

@@ -170,6 +170,15 @@ def test_many_records_in_one_transaction_keep_order_and_numbers(store):
     assert [item.payload for item in store.inbox_items(1000)] == payloads[40:]
 
 
+def test_rollback_discards_collected_rows(store):
+    with pytest.raises(ZeroDivisionError):
+        fail_within(store, lambda tx: (tx.send("k", "c", b"x", encoding=""), tx.accept("k", b"x", record(1, b"x"))))
+    assert store.outbox_depth() == store.inbox_depth() == 0
+    with store.transaction() as tx:
+        assert tx.send("k", "c", b"x", encoding="") == 1
+        assert not tx.was_received("k", record(1, b"x"))
+
+
 STEPS = st.sampled_from(["add", "put", "delete", "get", "names"])
 STATES = st.lists(st.tuples(STEPS, st.sampled_from("abc")), max_size=60)
 

@@ -8,7 +8,7 @@ from builders.common import WAIT_S, eventually, free_port
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.runtime.modem_port import UdpPort, open_modem_port
 from sonarpost.runtime.serial_modem import SerialModem
-from sonarpost.runtime.serial_port import PortEvent, PortOpened, SerialPort
+from sonarpost.runtime.serial_port import PortEvent, PortLost, PortOpened, SerialPort
 
 URL = f"udp://239.255.77.1:{free_port()}?interface=127.0.0.1&ttl=0"
 
@@ -30,6 +30,22 @@ def test_each_write_is_one_datagram_for_all():
     for port in ports:
         port.close()
         eventually(lambda port=port: not port.is_open)
+
+
+def test_unexpected_exception_counts_as_a_lost_port(monkeypatch):
+    read = UdpPort._read
+    errors = [AttributeError("a defect")]
+
+    def failing(*arguments):
+        if errors:
+            raise errors.pop()
+        read(*arguments)
+
+    monkeypatch.setattr(UdpPort, "_read", staticmethod(failing))
+    port, events = UdpPort(URL), queue.SimpleQueue[PortEvent]()
+    port.start(events.put)
+    assert [events.get(timeout=WAIT_S) for _ in range(3)] == [PortOpened(), PortLost("a defect"), PortOpened()]
+    port.close()
 
 
 def test_two_stations_exchange_packets():

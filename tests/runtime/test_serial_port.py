@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 import serial
-from builders.common import WAIT_S, eventually
+from builders.common import WAIT_S, eventually, free_port
 
 from sonarpost.errors import ConfigError, PortError
 from sonarpost.runtime import serial_device, serial_port
@@ -166,6 +166,20 @@ def test_a_socket_is_opened_again_after_it_was_closed(server, reset):
         port.close()
 
 
+def test_an_absent_server_is_retried(caplog):
+    number = free_port()
+    port = SerialPort(f"socket://127.0.0.1:{number}")
+    events = PortEvents(port)
+    try:
+        eventually(lambda: port.error is not None)
+        assert "refused" in (port.error or "")
+        with socket.create_server(("127.0.0.1", number)):
+            assert events.next() == PortOpened()
+        assert sum("cannot be opened" in record.getMessage() for record in caplog.records) == 1
+    finally:
+        port.close()
+
+
 def test_retries_slow_down_when_the_server_closes_each_connection(server, retries, monkeypatch):
     waits: list[float | None] = []
 
@@ -280,6 +294,21 @@ def test_second_program_is_refused_and_the_first_keeps_its_bytes(pty_port, first
     assert termios.tcgetattr(first.fileno()) == settings
     with pytest.raises(BlockingIOError):
         os.read(pty_port.master, 1)
+
+
+def test_port_in_use_is_retried_and_opened_when_it_is_free(pty_port, first, caplog):
+    port = SerialPort(str(pty_port.path))
+    events = PortEvents(port)
+    with closing(port):
+        eventually(lambda: port.error is not None)
+        assert port.error.startswith("in use by ")
+        assert port.error.endswith(ME)
+        assert not port.is_open
+        close_port(first)
+        assert events.next() == PortOpened()
+        assert port.error is None
+    [line] = [record for record in caplog.records if "cannot be opened" in record.message]
+    assert line.fields["reason"].endswith(ME)
 
 
 def test_each_reason_of_a_port_that_is_not_open_is_logged_once(pty_port, first, caplog):

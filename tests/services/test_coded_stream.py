@@ -321,7 +321,6 @@ def test_accepted_image_is_decoded_once_or_again_if_it_is_read_from_the_store(pl
 
 def test_number_of_accepted_images_in_memory_is_limited(platform, tmp_path, monkeypatch):
     monkeypatch.setattr("sonarpost.runtime.record_handler.MAX_DECODED", 3)
-    monkeypatch.setattr("sonarpost.runtime.record_handler.MAX_DECODED_BYTES", 4096)
     c2, key = C2Service(platform("shore-1"), C2Config(out_dir=tmp_path / "shore")), keys.shore_part(VESSEL)
     for number in range(1, 6):
         part = ImagePart(u="uuv-1", i=image_of_number(number), n=1, t=1.0, p=b"\x04\x30" + bytes(5000 * (number == 1)))

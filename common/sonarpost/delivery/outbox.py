@@ -24,6 +24,9 @@ class Outbox:
         store: Store with the outbox.
         queue_policy: Returns the settings of a queue; by default records are published and sent without a limit.
         on_acknowledged: Called in the transaction that removes an accepted or refused record.
+
+    Raises:
+        DeliveryError: The store cannot be read.
     """
 
     def __init__(
@@ -46,10 +49,15 @@ class Outbox:
 
     def _on_queued(self, queue: str, place: Place) -> None:
         """Start the sender of a queue when it first holds a record; tell it the place of a new one."""
-        with self._lock:
-            if queue not in self._senders and self._store.on_queued is not None:
-                self._senders[queue] = self._new_sender(queue)
-            sender = self._senders.get(queue)
+        try:
+            with self._lock:
+                if queue not in self._senders and self._store.on_queued is not None:
+                    self._senders[queue] = self._new_sender(queue)
+                sender = self._senders.get(queue)
+        except Exception:
+            # The record is committed. The next one of the queue starts its sender.
+            log.exception("Sender not started", extra=kv(consumer=queue))
+            return
         if sender is not None:
             sender.on_new(place)
 

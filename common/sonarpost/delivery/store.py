@@ -184,11 +184,11 @@ class Store:
             except sqlite3.Error as error:
                 raise DeliveryError(f"{self.path}: {_reason(error, self.path)}") from error
             self.states_discarded += tx.states_discarded
+        if tx.wrote_inbox:
+            self.inbox_changed.set()
         if (on_queued := self.on_queued) is not None:
             for queue, place in tx.first_places.items():
                 on_queued(queue, place)
-        if tx.wrote_inbox:
-            self.inbox_changed.set()
 
     def _query(self, sql: str, args: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
         """Query the writing connection, after the transaction in progress."""

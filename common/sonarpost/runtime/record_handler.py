@@ -38,8 +38,8 @@ ALONE_AFTER: Final = limit(
 FAILURES_ALONE: Final = limit(
     3, "failures", "blame", "all services", "sender", "failures alone while others are handled", "it is quarantined"
 )
-MAX_DECODED, MAX_DECODED_BYTES = 2048, 8 * 1024 * 1024
-"""Maximum number, and product of number and size, of the accepted records that are kept decoded until handled."""
+MAX_DECODED, MAX_DECODED_BYTES = 2048, 4096
+"""Maximum number and size of the accepted records that are kept decoded until they are handled."""
 TYPES_KEPT = 1000
 """Maximum number of keys in the cache of record types."""
 MAX_REFUSAL_LOGS = 64
@@ -85,8 +85,7 @@ class RecordHandler:
 
     def keep_decoded(self, key: str, payload: bytes, record: Record) -> bool:
         """Keep an accepted record until it is handled in its turn; return False."""
-        number = len(self._decoded) + 1
-        if number <= MAX_DECODED and number * len(payload) <= MAX_DECODED_BYTES:
+        if len(self._decoded) < MAX_DECODED and len(payload) <= MAX_DECODED_BYTES:
             self._decoded[key, payload] = record
         return False
 

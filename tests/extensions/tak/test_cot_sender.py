@@ -5,7 +5,7 @@ import ssl
 import threading
 
 import pytest
-from builders.common import WAIT_S, free_port
+from builders.common import WAIT_S, eventually, free_port
 from builders.tls_authority import Authority
 from extensions.tak.tak_server import TakServer
 
@@ -18,6 +18,7 @@ from sonarpost.security.client_tls import TlsFiles
 EVENTS = (b'<event uid="a"/>', b'<event uid="b"/>')
 STREAM = b'<event uid="a"/>\n<event uid="b"/>\n'
 OTHER = b"<event uid='other'/>"
+PASSPHRASE = b"atakatak"
 TLS_VERSIONS = (ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3)
 
 
@@ -287,7 +288,23 @@ def test_each_datagram_holds_one_event():
         CotSender("udp://127.0.0.1:9", TlsFiles()).send([b"x" * 65_001])
 
 
-# Name of the server
+# Files of TLS
+
+
+def test_encrypted_key_and_pkcs12(serve, authority, tmp_path):
+    server = serve(authority.server_context())
+    files = authority.issue("client")
+    client, truststore, key = authority.encrypted(files, PASSPHRASE)
+    passphrase = tmp_path / "passphrase"
+    passphrase.write_bytes(PASSPHRASE + b"\nmore")
+    passphrase.chmod(0o600)
+    for tls in (
+        TlsFiles(files.ca, files.certificate, key, passphrase),
+        TlsFiles(files.ca, client, None, passphrase),
+        TlsFiles(truststore, client, None, passphrase),
+    ):
+        sender_to(server, "tls", tls).send(EVENTS)
+    eventually(lambda: server.events() == 6)
 
 
 def test_expected_name_of_the_server(serve, authority):

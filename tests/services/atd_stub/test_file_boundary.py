@@ -1,6 +1,7 @@
 """atd_stub at file boundaries: an object across two files is one contact, and no held contact is lost."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import msgpack
 import numpy as np
@@ -49,11 +50,81 @@ def test_an_object_is_one_contact_at_any_file_boundary(boundary, wait_s, tmp_pat
     assert snippet.contact.line_name == snippet.source.removesuffix(".xtf") == f"line-{number}"
 
 
+def test_contacts_far_from_the_boundary_are_not_held(tmp_path):
+    survey = survey_of(300, Box(100), Box(260, Side.STARBOARD))
+    (path,) = split(tmp_path, survey, (0, 300))
+    result = detect_in_survey(path, "0" * 64, "uuv-1", HOLDING)
+    assert near(list(result.snippets), 100)
+    assert not near(list(result.snippets), 260, Side.STARBOARD)
+    assert near(list(result.held), 260, Side.STARBOARD)
+
+
+def test_short_files_are_joined(tmp_path):
+    survey = survey_of(250, Box(40), Box(100), Box(150, Side.STARBOARD), Box(199))
+    spans = list(pairwise(range(0, 251, 50)))
+    sent = detect_in_files(split(tmp_path, survey, *spans), join_timeout_s=30.0)
+    for row, side in ((40, Side.PORT), (100, Side.PORT), (150, Side.STARBOARD), (199, Side.PORT)):
+        assert len(near(sent, row, side)) == 1, row
+
+
+@pytest.mark.parametrize("wait_s", [0.0, 30.0])
+def test_repeated_pings_are_searched_once(wait_s, tmp_path):
+    survey = survey_of(300, Box(130), Box(100, Side.STARBOARD))
+    sent = detect_in_files(split(tmp_path, survey, (0, 150), (90, 300)), join_timeout_s=wait_s)
+    assert len(near(sent, 130)) == len(near(sent, 100, Side.STARBOARD)) == 1
+
+
+def test_each_object_of_a_long_file_is_one_contact_in_any_strip(tmp_path):
+    rows = [200, 780, 800, 860, 899, 901, 940, 985, 1000, 1600]
+    sides = [Side.PORT, Side.STARBOARD]
+    boxes = [Box(row, sides[n % 2]) for n, row in enumerate(rows)]
+    (path,) = split(tmp_path, survey_of(1700, *boxes), (0, 1700))
+    sent = detect_in_files([path], detector=FEW_CANDIDATES)
+    assert [len(near(sent, box.row, box.side)) for box in boxes] == [1] * len(boxes)
+
+
+def at_frequency(ping, frequency_hz):
+    return replace(ping, channels=tuple(replace(c, frequency_hz=frequency_hz) for c in ping.channels))
+
+
+@pytest.mark.parametrize("what", ["later", "elsewhere", "other sonar", "other range", "earlier", "other frequency"])
+def test_a_file_that_is_no_continuation_is_not_joined(what, tmp_path):
+    survey = survey_of(200, Box(97))
+    first, second = split(tmp_path, survey, (0, 100), (100, 200))
+    later = survey.pings[100:]
+    match what:
+        case "later":
+            later = tuple(replace(p, time_utc_s=p.time_utc_s + 5.0) for p in later)
+        case "elsewhere":
+            later = tuple(replace(p, lat_deg=p.lat_deg + 0.001) for p in later)
+        case "other range":
+            later = tuple(replace(p, channels=tuple(replace(c, slant_range_m=30.0) for c in p.channels)) for p in later)
+        case "earlier":
+            later = tuple(replace(p, time_utc_s=p.time_utc_s - 3600.0) for p in later)
+        case "other frequency":
+            written = replace(survey, pings=tuple(at_frequency(p, 400e3) for p in survey.pings[:100]))
+            write_xtf(replace(written, sonar_id="made"), first)
+            later = tuple(at_frequency(p, 900e3) for p in later)
+    write_xtf(replace(survey, pings=later, sonar_id="else" if what == "other sonar" else "made"), second)
+    before = detect_in_survey(first, "0" * 64, "uuv-1", HOLDING)
+    assert near(list(before.held), 97)
+    after = detect_in_survey(second, "1" * 64, "uuv-1", HOLDING, before.ends)
+    assert not after.joined
+    assert bool(near(list(after.not_continued), 97)) is (what != "other sonar")
+
+
 def test_a_stopped_clock_does_not_merge_contacts(tmp_path):
     survey = survey_of(260, Box(60), Box(120), Box(200))
     stopped = replace(survey, pings=tuple(replace(p, time_utc_s=START_S) for p in survey.pings))
     sent = detect_in_files(split(tmp_path, stopped, (0, 260)), detector=FEW_CANDIDATES)
     assert [len(near(sent, row)) for row in (60, 120, 200)] == [1, 1, 1]
+
+
+def test_max_contacts_keeps_the_most_confident(tmp_path):
+    (path,) = split(tmp_path, survey_of(500, *(Box(row) for row in range(60, 460, 60))), (0, 500))
+    every_contact = sorted(detect_in_files([path], detector=FEW_CANDIDATES), key=lambda s: -s.contact.atd_confidence)
+    limited = detect_in_files([path], max_contacts=3, detector=FEW_CANDIDATES)
+    assert [s.contact.contact_id for s in limited] == [s.contact.contact_id for s in every_contact[:3]]
 
 
 def test_a_file_end_is_restored_from_the_store(tmp_path):

@@ -26,8 +26,9 @@ from sonarpost.services.atd_stub import survey_detection
 from sonarpost.services.atd_stub.config import AtdStubConfig
 from sonarpost.services.atd_stub.input_folder import InputFile, StableFiles, list_input_files
 from sonarpost.services.atd_stub.snippet_files import read_snippet, write_snippet
+from sonarpost.sonar.geometry import Position, offset_between_m
 from sonarpost.sonar.image_files import read_image, write_tiff
-from sonarpost.sonar.options import Mounting
+from sonarpost.sonar.options import ErrorBudget, Mounting
 from sonarpost.sonar.readers import open_survey
 from sonarpost.sonar.side_car import SideCar, contact_text, read_side_car
 from sonarpost.sonar.source import load_survey
@@ -70,6 +71,34 @@ def test_a_contact_has_every_field_of_the_record(line):
     assert contact.height_m == pytest.approx(
         found.shadow_m * found.altitude_m / (found.slant_range_m + found.shadow_m), rel=1e-9
     )
+
+
+def test_the_position_error_follows_from_the_configured_error_budget(line):
+    _, _, default = best_contact_of(line, AtdStubConfig())
+    assert 5 < default.position_sigma_m < 8
+    _, _, precise = best_contact_of(line, AtdStubConfig(errors=ErrorBudget(position_m=0.5)))
+    assert precise.position_sigma_m < default.position_sigma_m - 3
+    assert (precise.lat_deg, precise.lon_deg) == (default.lat_deg, default.lon_deg)
+
+
+def test_layback_moves_the_contact_back_along_the_track(line):
+    _, found, plain = best_contact_of(line, AtdStubConfig())
+    _, _, towed = best_contact_of(line, AtdStubConfig(mounting=Mounting(layback_m=30.0)))
+    north_m, east_m = offset_between_m(Position(plain.lat_deg, plain.lon_deg), Position(towed.lat_deg, towed.lon_deg))
+    bearing_deg = np.degrees(np.arctan2(east_m, north_m)) % 360
+    assert np.hypot(north_m, east_m) == pytest.approx(30.0, abs=0.01)
+    assert (bearing_deg - found.heading_deg) % 360 == pytest.approx(180.0, abs=0.1)
+    assert towed.position_sigma_m > plain.position_sigma_m, "the position of a towed sonar is uncertain"
+
+
+@pytest.mark.parametrize("missing", ["lat_deg", "heading_deg"])
+def test_without_fix_or_heading_there_is_no_position(missing, line):
+    def without(ping):
+        return replace(ping, **({"lat_deg": None, "lon_deg": None} if missing == "lat_deg" else {missing: None}))
+
+    _, _, contact = best_contact_of(line, AtdStubConfig(), without)
+    assert (contact.lat_deg, contact.lon_deg, contact.position_sigma_m) == (None, None, None)
+    assert contact.slant_range_m is not None
 
 
 def test_a_truncated_shadow_gives_no_height(line):

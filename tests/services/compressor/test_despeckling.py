@@ -55,6 +55,12 @@ def test_original_sends_the_contact_without_despeckling_and_is_refined(start_ser
     assert (counters["images_encoded"], counters["images_original"], counters["images_refined"]) == (2, 1, 1)
 
 
+def test_original_command_arrives_through_the_acoustic_link(start_service, encoded, command_over_the_link, snippet):
+    start_service(**EMB)
+    [first] = encoded(snippet("c1", 64, 64))
+    assert strength_of(command_over_the_link("original", first.image_id)) == 0.0
+
+
 def test_a_repeated_original_command_sends_the_same_image(start_service, restart, encoded, answer, snippet):
     service = start_service(**EMB)
     first, _ = encoded(snippet("c1", 64, 64), snippet("c2", 64, 64, seed=2))
@@ -63,6 +69,17 @@ def test_a_repeated_original_command_sends_the_same_image(start_service, restart
     service = restart(service, **EMB, despeckle_strength=0.5)
     assert answer("original", first.image_id) == original
     assert "images_original" not in service.health().counters
+
+
+def test_an_original_image_that_left_the_cache_is_encoded_again(start_service, encoded, answer, snippet):
+    start_service(**EMB, cache_images=2)
+    [first] = encoded(snippet("c1", 64, 64))
+    original = answer("original", first.image_id)
+    answer("refine", first.image_id)  # now the original image is the oldest entry
+    encoded(snippet("c2", 64, 64, seed=2))
+    again = answer("original", first.image_id)
+    assert again.stream == original.stream
+    assert again.image_id != original.image_id
 
 
 @pytest.mark.parametrize("options", [{"despeckle_strength": 0.0}, {"codec": "vq", "budget_bytes": 0}])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from builders.common import eventually
 
-from sonarpost import keys
+from sonarpost import keys, wire
 from sonarpost.codec.interface import StreamHeader, to_uint8
 from sonarpost.codec.vq.codec import IndexPacking
 from sonarpost.errors import CodebookError, ConfigError
@@ -72,6 +72,30 @@ def test_a_budget_that_cannot_be_met_is_reported(start_service, atd, modem, snip
     assert modem.received == []
 
 
+def test_malformed_snippets_are_refused_and_the_next_one_is_encoded(start_service, atd, modem, snippet, refused):
+    service = start_service()
+    fields = msgpack.unpackb(wire.encode(snippet("spoilt")))
+    bad = [
+        b"",
+        b"\xc1",
+        msgpack.packb(list(fields)),
+        msgpack.packb(fields | {"v": 2}),
+        msgpack.packb(fields | {"type": "decision"}),
+        msgpack.packb(fields | {"pixels": fields["pixels"] | {"data": b"short"}}),
+    ]
+    for payload in bad:
+        atd.send_bytes(IN, "compressor", payload)
+    atd.send(IN, "compressor", snippet("good"))
+    eventually(lambda: [i.contact.contact_id for i in modem.received] == ["good"])
+    # The producer quarantines them too, with the same reasons.
+    eventually(lambda: refused(atd) == refused(service))
+    assert len(refused(service)) == service.health().counters["records_refused"] == len(bad)
+    for key, reason in refused(service):
+        assert key == IN
+        assert IN in reason
+        assert "expected" in reason
+
+
 def test_identifiers_continue_after_restarts(start_service, runner, atd, modem, snippet):
     for turn in range(3):
         service = start_service()
@@ -124,3 +148,13 @@ def test_a_configuration_error_is_raised_before_the_store_is_opened(options, err
     with pytest.raises(error, match=expected):
         CompressorService(platform("uuv-1"), CompressorConfig(**options))
     assert not (platform("uuv-1").state_dir / "compressor.db").exists()
+
+
+def test_the_sender_keeps_the_snippet_while_the_disk_is_full(start_service, atd, modem, snippet, full_disk):
+    service = start_service()
+    with full_disk(service):
+        atd.send(IN, "compressor", snippet("late", 200, 200))
+        eventually(lambda: service.health().state == "degraded")
+        assert atd.store.outbox_depth() == 1
+    eventually(lambda: len(modem.received) == 1)
+    eventually(lambda: service.health().state == "ok")

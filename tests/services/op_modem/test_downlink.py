@@ -11,6 +11,7 @@ from builders.vessel_frames import CONTACT, packet
 from pydantic import ValidationError
 
 from sonarpost import keys, wire
+from sonarpost.delivery.store import Store
 from sonarpost.errors import ConfigError, PayloadError
 from sonarpost.link.auth.authentication import FrameAuthenticator
 from sonarpost.link.auth.key import Direction
@@ -396,6 +397,18 @@ def test_vehicle_of_another_vessel_gets_no_feedback(begin, runner, complete):
         service.on_modem_event(packet(data, dest=9))
     assert service.health().gauges["feedback_open"] == 0.0
     eventually(lambda: complete() == {1, 2})
+
+
+def test_unreadable_state_is_discarded_and_counted(begin, runner, caplog):
+    service = begin()
+    runner.stop(service)
+    store = Store(service.store.path)
+    with store.transaction() as tx:
+        tx.put_state("vehicle/link/endpoint", b"\xc1")
+    store.close()
+    service = begin()
+    assert service.health().counters["states_discarded"] == 1
+    assert service.health().gauges["commands_open"] == 0.0
 
 
 def gate(**options):

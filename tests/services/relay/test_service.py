@@ -64,6 +64,19 @@ def test_a_batch_is_one_line_and_each_record_has_its_own_at_level_debug(platform
         assert lines[-1].endswith(" decisions_relayed=2")
 
 
+def test_records_wait_for_the_shore_and_decisions_are_first(begin, runner, c2, source):
+    service = begin()
+    source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(3)))
+    eventually(lambda: service.health().gauges["waiting_for_shore"] == 3.0)
+    source.send(DECISIONS, "relay", decision_record("d1"), decision_record("d2"))
+    eventually(lambda: service.health().gauges["waiting_for_shore"] == 5.0)
+    runner.stop(service)
+    shore = c2()
+    begin()
+    eventually(lambda: len(shore.received) == 5)
+    assert [identity(record) for record in shore.received] == ["d1", "d2", "0000", "0001", "0002"]
+
+
 def test_record_of_another_vessel_is_refused_to_its_sender_and_logged(begin, c2, source, refused, capsys):
     logs.configure_logging("relay")
     shore, service = c2(), begin()
@@ -79,6 +92,18 @@ def test_record_of_another_vessel_is_refused_to_its_sender_and_logged(begin, c2,
     assert "vehicle=uuv-1 image_id=00A7" in lines[0]
 
 
+def test_invalid_records_are_refused_and_the_next_one_relayed(begin, c2, source, refused):
+    shore, service = c2(), begin()
+    invalid = [b"", b"\xff", msgpack.packb({"type": "decision", "v": 1}), wire.encode(decision_record())[:-1]]
+    for payload in invalid:
+        source.send_bytes(DECISIONS, "relay", payload)
+    source.send(DECISIONS, "relay", decision_record())
+    eventually(lambda: len(shore.received) == 1)
+    assert [key for key, _ in refused(service)] == [DECISIONS] * len(invalid)
+    assert all("expected" in reason for _, reason in refused(service))
+    assert service.health().state == "ok"
+
+
 def test_record_is_relayed_once_after_a_stop_before_sending(begin, runner, c2, platform):
     idle = RelayService(platform("vessel-1"), RelayConfig())
     with idle.store.transaction() as tx:
@@ -91,6 +116,17 @@ def test_record_is_relayed_once_after_a_stop_before_sending(begin, runner, c2, p
     # The shore site acknowledges a record before it handles it.
     eventually(lambda: again.health().gauges["waiting_for_shore"] == 0.0 and shore.received)
     assert [identity(record) for record in shore.received] == ["AAAA"]
+
+
+def test_sender_keeps_the_record_while_the_disk_is_full(begin, c2, source):
+    shore, service = c2(), begin()
+    service.store._db.execute("PRAGMA max_page_count=1")
+    source.send(IMAGES, "relay", *(image(f"{n:04d}") for n in range(6)))
+    eventually(lambda: service.health().state == "degraded")
+    assert source.store.outbox_depth() > 0
+    service.store._db.execute("PRAGMA max_page_count=1000000")
+    eventually(lambda: len(shore.received) == 6)
+    eventually(lambda: service.health().state == "ok")
 
 
 def test_latest_status_of_each_vehicle_waits_for_the_shore_and_precedes_images(begin, runner, c2, source, client):

@@ -165,6 +165,15 @@ def test_unexpected_exception_about_a_frame_loses_that_frame_only(start_service,
     assert not service.failed
 
 
+def test_count_that_cannot_be_read_does_not_stop_the_service(start_service, runner, refused):
+    service = start_service()
+    runner.stop(service)
+    fill(service, **{"link/images_accepted": b"many"})
+    again = start_service()
+    eventually(lambda: again.health().counters.get("states_discarded") == 1)
+    assert [key for key, _ in refused(again)] == ["state link/images_accepted"]
+
+
 def test_repeated_commands_are_recognised_by_shares_of_the_modems():
     commands = ReceivedCommands("uuv-1", UuvModemConfig(port="unused"))
     own = ResendMessage(0, 1_700_000_000, 1)

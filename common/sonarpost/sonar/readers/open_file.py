@@ -56,20 +56,26 @@ class CheckedFile:
         """Yield the lines of a UTF-8 text with their line ends, without a byte order mark.
 
         Raises:
-            SurveyFileError: Not UTF-8, a line over 64 KiB, or an unreadable file; the message contains the line number.
+            SurveyFileError: Not UTF-8, or a line over 64 KiB: the message contains its number. Or an unreadable file.
         """
         reader = SequentialReader(self)
         offset = number = 0
         while offset < self.size_bytes:
-            number += 1
-            line, end, _ = reader.peek(offset, _LINE_BYTES + 1).partition(b"\n")
-            if len(line) > _LINE_BYTES:
-                raise self.error(f"line {number}", f"over {_LINE_BYTES} bytes", "shorter lines")
-            offset += len(line) + len(end)
-            try:
-                yield line.decode("utf-8-sig" if number == 1 else "utf-8") + "\n"
-            except UnicodeDecodeError as error:
-                raise self.error(f"line {number}", str(error), "UTF-8") from error
+            block = reader.peek(offset, _LINE_BYTES + 1)
+            *lines, rest = block.split(b"\n")
+            offset += len(block)
+            if not lines or (offset == self.size_bytes and rest):
+                lines.append(rest)  # the last one, or one that is too long
+            else:
+                offset -= len(rest)
+            for line in lines:
+                number += 1
+                if len(line) > _LINE_BYTES:
+                    raise self.error(f"line {number}", f"over {_LINE_BYTES} bytes", "shorter lines")
+                try:
+                    yield line.decode("utf-8-sig" if number == 1 else "utf-8") + "\n"
+                except UnicodeDecodeError as error:
+                    raise self.error(f"line {number}", str(error), "UTF-8") from error
 
     def check_unchanged(self) -> None:
         """Check that the file was not written to since it was opened.
