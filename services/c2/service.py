@@ -354,7 +354,8 @@ class C2Service(Service[C2Config]):
     def _take_over(self) -> None:
         """Handle the records that another c2 has acknowledged and not handled before it ended."""
         while not self.stopping.wait(TAKE_OVER_INTERVAL_S):
-            self._prefer_others(others=not self._try("take-over", self._take_over_all))
+            is_reached = self._try("take-over", self._take_over_all)
+            self._prefer_others(others=not is_reached)
 
     def _prefer_others(self, *, others: bool) -> None:
         """Leave records and queries to c2 that reach the database while there is one, or end that."""

@@ -378,8 +378,9 @@ def test_two_replies_to_one_query_are_one_page_for_a_subscriber(begin, reading, 
 def both_reply(hosts):
     with pytest.MonkeyPatch.context() as patch:
         for host in hosts:
-            patch.setattr(host, "_prefer_others", lambda **_: None)
-            host._queries.set_preferred(is_preferred=False)
+            set_preferred = host._queries.set_preferred
+            patch.setattr(host._queries, "set_preferred", lambda **_: None)
+            set_preferred(is_preferred=False)
         yield
 
 
