@@ -48,7 +48,7 @@ class Outbox:
             self._on_queued(queue, FIRST_PLACE)
 
     def _on_queued(self, queue: str, place: Place) -> None:
-        """Start the sender of a queue when it first holds a record; tell it the place of a new one."""
+        """Start the sender of a queue when it first holds a record; pass the place of a new record to it."""
         try:
             with self._lock:
                 if queue not in self._senders and self._store.on_queued is not None:

@@ -150,7 +150,7 @@ class QueueSender:
         self._thread.join(timeout=0.5)
 
     def on_new(self, place: Place) -> None:
-        """Use that a record was queued at a place."""
+        """Continue with a record that was queued at this place."""
         self._new_places.append(place)
         self._wake.set()
 

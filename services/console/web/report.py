@@ -211,7 +211,7 @@ def _image_facts(given: ReportContact) -> list[Fact]:
 
 
 def _integrity_text(given: ReportContact) -> str:
-    """Return what of the original the image contains."""
+    """Return which part of the original image was received, and how fine its detail is."""
     image = given.stored.image
     version: Json = next((v for v in given.detail["versions"] if v["version"] == image.version), {})
     if not image.codec:

@@ -1,6 +1,6 @@
 """Text reports of contacts: lines in the form of CARIS contact files, and a report in the manner of APP-11.
 
-Neither is conformant. `docs/reference/exports.md` states what is publicly described and what is not.
+Neither is conformant. `docs/reference/exports.md` lists which parts are publicly described.
 """
 
 import re
